@@ -28,22 +28,19 @@ from dvrk_drake.cli.report import Report, check_report, write_page
 from dvrk_drake.cli.support import (
     Steps,
     check_output,
-    command_words,
     load_model,
     mounted,
     plots_folder,
     print_notes,
     print_warnings,
     print_written,
-    quiet_drake,
     write_json,
 )
 from dvrk_drake.errors import ModelError
 
 if TYPE_CHECKING:
     from dvrk_drake.analysis.results import Identification, Validation
-    from dvrk_drake.reports.html.page import Page
-    from dvrk_drake.reports.provenance import Provenance
+    from dvrk_drake.reports.page import Page
 
 
 def _gravity(_: object, tokens: Sequence[Token]) -> tuple[float, float, float] | Literal["estimate"]:
@@ -69,6 +66,10 @@ OwnGravity = Annotated[
         "of the numbers estimates the direction from the recording. Default: the vector in the arm file.",
     ),
 ]
+Compare = Annotated[
+    str | None,
+    Parameter(metavar="MODEL.yaml", help="Previous model. Its errors on the recording are shown beside the new ones."),
+]
 NewModel = Annotated[str, Parameter(metavar="MODEL.yaml", help="Model file to write.")]
 _FILE = FileOptions()
 _STEPS = "reading", "checking the recording"
@@ -86,6 +87,7 @@ def identify_model(
     method: Literal["robust", "paper"] = "robust",
     gravity: OwnGravity = None,
     locked: Locked = None,
+    compare: Compare = None,
     plots: Plots = None,
     report: Report = None,
     overwrite: Overwrite = False,
@@ -101,8 +103,7 @@ def identify_model(
         others: More motions of the same arm, or static poses.
         method: Method for static poses: robust regression, or the least squares of the paper (Rutfield et al., 2015).
     """
-    from dvrk_drake.reports.identification import print_identification
-    from dvrk_drake.reports.terminal_tables import make_console
+    from dvrk_drake.reports.terminal import make_console, print_page
 
     paths = (recording, *others)
     check_output(output, *paths, overwrite=overwrite)
@@ -123,53 +124,38 @@ def identify_model(
         )
     # Results are saved before printing, because the reader of the output (e.g. head) may close the pipe.
     result.save(output, overwrite=True)
-    if folder is not None:
-        from dvrk_drake.reports.figures.identification import plot_identification
-
-        plot_identification(folder, result)
-    console = make_console()
-    print_identification(console, result, model_path=output, file_options=file.as_text(), verbose=verbose)
+    page, console = _page(result, output, file, compare), make_console()
+    print_page(console, page, verbose=verbose)
     if result.note:
         console.print(result.note)
     print_warnings(console, result.warnings)
     print_written(output)
-    if folder is not None:
-        print_written(folder)
-    _write_report(result, report, output, file, *paths)
+    _print_report_option(report)
+    write_page(page, folder, report, *paths)
 
 
-def _write_report(
-    result: Identification | Validation,
-    report: str | None,
-    model: str,
-    file: FileOptions,
-    *inputs: str,
-    saved: bool = False,
-) -> None:
-    """Writes the report given with --report, or prints which option writes a report.
+def _page(
+    result: Identification | Validation, model: str, file: FileOptions, compare: str | None, *, saved: bool = False
+) -> Page:
+    """Returns the page of a result, with the errors of the SDF and of the model given with --compare.
 
     Args:
         result: Result of the command.
-        report: Path of the report, or None.
         model: Path of the model file.
         file: Options with which the recording was read.
-        inputs: Paths of the input files.
+        compare: Path of a previous model, or None.
         saved: Whether the verdicts are stored in the model file.
     """
+    from dvrk_drake.analysis.baselines import baseline_efforts
+    from dvrk_drake.reports.identification import identification_page
+
+    baselines = baseline_efforts(result, None if compare is None else load_model(compare, None))
+    return identification_page(result, model_path=model, file_options=file.as_text(), saved=saved, baselines=baselines)
+
+
+def _print_report_option(report: str | None) -> None:
     if report is None:
         print("--report FILE.html writes plots, parameters with intervals and a 3D view of the recording.", flush=True)
-        return
-    from dvrk_drake.reports.html.identification import identification_page
-    from dvrk_drake.reports.provenance import Provenance
-
-    quiet_drake()
-
-    def page(provenance: Provenance) -> Page:
-        return identification_page(result, provenance, model_path=model, file_options=file.as_text(), saved=saved)
-
-    with Steps("writing the report"):
-        page(Provenance.of(inputs, command_words)).write(report)
-    print_written(report, "report")
 
 
 def _model_and_recording(
@@ -189,6 +175,7 @@ def validate(
     *,
     model: Model,
     file: FileOptions = _FILE,
+    compare: Compare = None,
     require: Literal["good", "usable"] | None = None,
     save: Annotated[bool, Parameter(show_default=False)] = False,
     json: Json = None,
@@ -203,8 +190,7 @@ def validate(
         require: Exit with code 2 unless each joint with feedforward has at least this verdict.
         save: Store the verdicts in the model file; dvrk-drake control checks them.
     """
-    from dvrk_drake.reports.identification import print_validation
-    from dvrk_drake.reports.terminal_tables import make_console
+    from dvrk_drake.reports.terminal import make_console, print_page
 
     if json is not None:
         check_output(json, recording, model, overwrite=overwrite)
@@ -228,22 +214,17 @@ def validate(
         validation.save(model, overwrite=True)
     if json is not None:
         write_json(json, validation.as_dict())
-    if folder is not None:
-        from dvrk_drake.reports.figures.identification import plot_validation
-
-        plot_validation(folder, validation)
-    console = make_console()
-    print_validation(console, validation, model_path=model, file_options=file.as_text(), saved=save, verbose=verbose)
+    page, console = _page(validation, model, file, compare, saved=save), make_console()
+    print_page(console, page, verbose=verbose)
     if validation.note:
         console.print(validation.note)
     print_warnings(console, validation.warnings)
-    if folder is not None:
-        print_written(folder)
     if json is not None:
         print_written(json)
     if save:
         print_written(model, "verdicts stored")
-    _write_report(validation, report, model, file, recording, model, saved=save)
+    _print_report_option(report)
+    write_page(page, folder, report, recording, model)
     if require is not None and (failed := validation.unfit(require)):
         advice = "identify from a recording with more varied poses"
         if loaded.dynamics is not None:
@@ -273,7 +254,7 @@ def predict(
             another day than that of the model's recording.
     """
     from dvrk_drake.recordings.writer_csv import write_csv
-    from dvrk_drake.reports.terminal_tables import make_console
+    from dvrk_drake.reports.terminal import make_console
 
     check_output(output, recording, model, overwrite=overwrite)
     with Steps(*_STEPS, "predicting") as steps:
@@ -307,14 +288,14 @@ def recalibrate(
 
     The result is valid only for similar motions, positions and speeds (docs/payload.md).
     """
-    from dvrk_drake.reports.identification import print_recalibration
-    from dvrk_drake.reports.terminal_tables import make_console
+    from dvrk_drake.reports.identification import recalibration_page
+    from dvrk_drake.reports.terminal import make_console, print_page
 
     check_output(output, recording, model, overwrite=overwrite)
     with Steps(*_STEPS, "refitting friction") as steps:
         result = dvrk.recalibrate(*_model_and_recording(model, recording, file, steps), progress=steps)
     result.save(output, overwrite=True)
-    print_recalibration(make_console(), result, model_path=output, verbose=verbose)
+    print_page(make_console(), recalibration_page(result, model_path=output), verbose=verbose)
     print_written(output)
 
 

@@ -1,475 +1,437 @@
-"""Prints identification, validation and recalibration results to a terminal."""
+"""Pages of an identification, a validation and a recalibration, for static poses and for motions."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
-from rich.markup import escape
+from numpy.typing import NDArray
 
 from dvrk_drake.analysis.dynamic.dynamic_identification import DynamicIdentification
-from dvrk_drake.analysis.dynamic.estimates import MIN_IDENTIFIABILITY
-from dvrk_drake.analysis.dynamic.validation import SHARE_LABELS, DynamicValidation
+from dvrk_drake.analysis.dynamic.validation import DynamicValidation
 from dvrk_drake.analysis.recalibration import FOLDS, Recalibration
 from dvrk_drake.analysis.results import Identification, Validation
-from dvrk_drake.analysis.static.excluded_measurements import ExcludedMeasurement
 from dvrk_drake.analysis.static.static_identification import StaticIdentification
 from dvrk_drake.analysis.static.validation import StaticValidation
 from dvrk_drake.analysis.verdict import MIN_COVERAGE, cross_validated_verdicts, identified_coverage, rule_text
-from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
-from dvrk_drake.dynamics.dynamic_section import CorrelatedEstimates, DynamicSection
-from dvrk_drake.dynamics.gravity_parameters import gravity_parameters
-from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
-from dvrk_drake.dynamics.physical_consistency import total_mass_reached
-from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.effect_kinds import EFFECT_KINDS
-from dvrk_drake.models.effects_schema import DriveEffect, half_width
-from dvrk_drake.reports.answers import Answer, answer_of, percent
-from dvrk_drake.reports.terminal_tables import make_table, print_answer, print_note
+from dvrk_drake.dynamics.identified_model import Verdict as VerdictWord
+from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.reports.answers import answer_of, percent
+from dvrk_drake.reports.drives import drive_plots
+from dvrk_drake.reports.efforts import (
+    Efforts,
+    budget_plot,
+    efforts_of,
+    efforts_plot,
+    predicted_plot,
+    residuals_plot,
+    structure_table,
+)
+from dvrk_drake.reports.page import Block, Level, Page, Scene, Section, Table, Text, Verdict
+from dvrk_drake.reports.parameters import parameter_blocks
+from dvrk_drake.reports.playback import playback
+from dvrk_drake.reports.plot import length_unit
 
-#: Colours of table rows by verdict.
-_STYLES: dict[Verdict, str] = {"do not use": "red", "not judged": "yellow"}
-_EFFECT_COLUMNS = ("", "kind", "scale", "value", "+-", "unit (revolute)")
-_NAME_WIDTH = 64
-
-
-def print_identification(
-    console: Console,
-    result: Identification,
-    *,
-    model_path: str = "MODEL.yaml",
-    file_options: str = "",
-    verbose: bool = False,
-) -> None:
-    """Prints the verdict and the cross-validated error of each joint.
-
-    Args:
-        console: Console to print to.
-        result: Result for static poses or for a motion.
-        model_path: Path of the written model, for the suggested next command.
-        file_options: Options with which the recording was read, beginning with a space, for the suggested next command.
-        verbose: Whether to print each parameter with its standard error, and the excluded measurements.
-    """
-    answer = answer_of(result, model_path=model_path, file_options=file_options)
-    _print_answer(console, answer)
-    verdicts = cross_validated_verdicts(result.model)
-    if isinstance(result, DynamicIdentification):
-        _print_motion_errors(console, result, verdicts)
-        if verbose:
-            _print_motion_details(console, result)
-    elif isinstance(result, StaticIdentification):
-        _print_pose_errors(console, result, verdicts, verbose)
-        if verbose:
-            _print_pose_details(console, result)
-    _print_coverage(console, verdicts, identified_coverage(result.model).tolist())
-    _print_locked_joints(console, result.model.arm)
+#: Level of each verdict. "off" and "not judged" have no colour.
+LEVELS: dict[VerdictWord, Level] = {
+    "good": "good",
+    "usable": "warning",
+    "do not use": "bad",
+    "off": "plain",
+    "not judged": "plain",
+}
+Result = Identification | Validation
 
 
-def _print_coverage(console: Console, verdicts: Mapping[str, Verdict], covered: Sequence[float]) -> None:
-    """Prints the joints of which too little of the range is covered for the verdict "good"."""
-    judged = zip(verdicts.items(), covered, strict=True)
-    few = [name for (name, verdict), share in judged if verdict == "usable" and share < MIN_COVERAGE]
-    if few:
-        limit = f"less than {100 * MIN_COVERAGE:g} % of the range (at most 180 deg) is covered"
-        text = f"At most usable, because {limit}: {', '.join(few)}."
-        console.print(text, markup=False)
-
-
-def _print_locked_joints(console: Console, arm: Arm) -> None:
-    """Prints the locked joints, and the positions for which the model is valid."""
-    if arm.locked_joints:
-        console.print(
-            f"Not in the recording: {', '.join(arm.locked_joints)}. The model is valid only for {arm.locked_text} "
-            "[rad, m], and it has no efforts of these joints.",
-            style="yellow",
-            markup=False,
-        )
-
-
-def print_validation(
-    console: Console,
-    validation: Validation,
+def identification_page(
+    result: Result,
     *,
     model_path: str = "MODEL.yaml",
     file_options: str = "",
     saved: bool = False,
-    verbose: bool = False,
-) -> None:
-    """Prints the verdict on a recording and the error of each joint.
+    baselines: Mapping[str, NDArray[np.float64]] | None = None,
+) -> Page:
+    """Returns the page of a result of `identify` or `validate`.
 
     Args:
-        console: Console to print to.
-        validation: Result for static poses or for a motion.
+        result: Result for static poses or for a motion.
         model_path: Path of the model, for the suggested next command.
         file_options: Options with which the recording was read, beginning with a space, for the suggested next command.
-        saved: Whether the verdicts are stored in the model file, from which the command `control` reads them.
-        verbose: Whether to print the rule for the verdicts, the kinds of errors, and the excluded measurements.
+        saved: Whether the verdicts of a validation are stored in the model file.
+        baselines: Efforts of other models for the (first) recording, see `baseline_efforts`.
     """
-    answer = answer_of(validation, model_path=model_path, file_options=file_options, saved=saved)
-    _print_answer(console, answer)
-    if isinstance(validation, DynamicValidation):
-        _print_motion_validation(console, validation, verbose)
-    elif isinstance(validation, StaticValidation):
-        _print_pose_validation(console, validation, verbose)
-    if isinstance(validation, DynamicValidation | StaticValidation):
-        judged = validation.actuators if isinstance(validation, DynamicValidation) else validation.joints
-        _print_coverage(console, validation.verdicts, [joint.coverage for joint in judged])
-    _print_locked_joints(console, validation.model.arm)
-
-
-def print_recalibration(
-    console: Console, result: Recalibration, *, model_path: str = "MODEL.yaml", verbose: bool = False
-) -> None:
-    """Prints the errors before and after the refit, and the change of friction and offsets.
-
-    Args:
-        console: Console to print to.
-        result: Result of the recalibration.
-        model_path: Path of the new model, for the suggested next command.
-        verbose: Whether to print the definition of the errors, and the factors of friction that acts on several
-            actuators.
-    """
-    before, after = (float(np.mean([getattr(a, which) for a in result.actuators])) for which in ("before", "after"))
-    kept = sum(a.kept for a in result.actuators)
-    print_answer(
-        console,
-        f"Mean effort error {percent(before)} before and {percent(after)} after the refit, cross-validated; "
-        f"{kept} of {len(result.actuators)} actuators refitted.",
-        f"dvrk-drake validate OTHER.csv --model {model_path} --save",
+    efforts = efforts_of(result, baselines)
+    others = [efforts_of(result, None, k) for k in range(1, _num_recordings(result))]
+    answer = answer_of(result, model_path=model_path, file_options=file_options, saved=saved)
+    every = [efforts, *others]
+    names = ", ".join(_name(own.recording) for own in every)
+    what = f"{len(efforts.measured)} static poses"
+    if efforts.v is not None:
+        seconds = sum(own.x[-1] - own.x[0] for own in every)
+        what = f"motion of {seconds:.0f} s" if not others else f"{len(every)} motions, {seconds:.0f} s"
+    task = "validation" if isinstance(result, Validation) else "identification"
+    sections = [
+        Section("Verdict per joint", [*_errors(result, efforts), *_remarks(result)]),
+        *_effort_sections(efforts, "" if not others else names.split(", ")[0], ""),
+    ]
+    for k, own in enumerate(others, 2):
+        sections += _effort_sections(own, _name(own.recording), f"_{k}")
+    sections += [
+        Section("Data quality", _data_quality(result, efforts), folded=True),
+        Section("Friction and cable curves", drive_plots(efforts), folded=True),
+        Section("Parameters and physical consistency", parameter_blocks(result.model), folded=True),
+    ]
+    return Page(
+        f"{result.model.arm.name}: {task} with {names}, {what}",
+        answer.text,
+        [section for section in sections if section.blocks],
+        LEVELS[answer.verdict],
+        answer.next_command,
+        answer.next_purpose,
     )
-    table = make_table(
-        f"{result.model.arm.name}, {result.seconds:.1f} s of motion: effort error, change of friction and offset",
-        *(
-            "",
-            "error before",
-            "error after",
-            "dry friction factor",
-            "viscous factor",
-            "offset change [N m; N]",
-            "unchanged because",
-        ),
-    )
-    for a in result.actuators:
-        new = [_factor(a.dry), _factor(a.viscous), f"{a.offset:+.4f}"] if a.kept else ["", "", ""]
-        table.add_row(a.name, percent(a.before), percent(a.after), *new, a.reason)
-    table.columns[-1].justify, table.columns[-1].no_wrap = "left", False
-    table.add_row("mean", percent(before), percent(after), "", "", "", "")
-    console.print(table)
-    print_note(
-        console,
-        "The improvement is valid for similar motions. At other positions and speeds, the improvement can be much "
-        "smaller. Validate the new model on the motion that you need.",
-    )
-    if not verbose:
-        return
-    print_note(
-        console,
-        f"Error: RMS(measured - predicted effort) / RMS(measured effort), after the low-pass filter of the model. "
-        f"Error after: {FOLDS}-fold cross-validation over the motion. Factors and offsets: fit to the whole motion.",
-    )
-    if result.shared:
-        shared = ", ".join(f"{name} x {scale:.2f}" for name, scale in result.shared.items())
-        console.print(f"Factors of friction that acts on several actuators: {shared}", markup=False)
 
 
-def _print_answer(console: Console, answer: Answer) -> None:
-    print_answer(console, answer.text, answer.next_command, _STYLES.get(answer.verdict, "green"))
+def _name(recording: Recording) -> str:
+    return Path(recording.source).name or "recording"
 
 
-def _print_motion_errors(console: Console, result: DynamicIdentification, verdicts: Mapping[str, Verdict]) -> None:
-    section = result.model.dynamic_model.section
+def _num_recordings(result: Result) -> int:
+    return len(result.motions) if isinstance(result, DynamicIdentification) else 1
+
+
+def _errors(result: Result, efforts: Efforts) -> list[Block]:
+    """Returns the table of verdicts and errors, with the errors of other models beside them."""
+    if isinstance(result, DynamicIdentification):
+        return _identified_motion(result, efforts)
+    if isinstance(result, StaticIdentification):
+        return _identified_poses(result, efforts)
+    if isinstance(result, DynamicValidation):
+        return _validated_motion(result, efforts)
+    assert isinstance(result, StaticValidation)
+    return _validated_poses(result, efforts)
+
+
+def _label(verdict: VerdictWord) -> Verdict:
+    return Verdict(verdict, LEVELS[verdict])
+
+
+def _ratio(error: float, effort: float) -> str:
+    return f"{error / effort:.2f}" if effort > 0 else ""
+
+
+def _baseline_ratios(efforts: Efforts) -> dict[str, NDArray[np.float64]]:
+    """Returns the relative errors (n,) of other models [1], 0 for a joint without an effort."""
+    effort = efforts.rms(efforts.measured)
+    ratios = {}
+    for name in efforts.baselines:
+        error = efforts.rms_of_baseline(name)
+        ratios[f"{name} error"] = np.divide(error, effort, out=np.zeros_like(error), where=effort > 0)
+    return ratios
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence], caption: str, note: str = "") -> Table:
+    right = [k > 1 for k in range(len(header))]
+    return Table(("joint", "verdict", *header), rows, caption, note, right=[False, False, *right[2:], True, True])
+
+
+def _identified_motion(result: DynamicIdentification, efforts: Efforts) -> list[Block]:
+    section, verdicts = result.model.dynamic_model.section, cross_validated_verdicts(result.model)
+    others = _baseline_ratios(efforts)
+    errors = ("rms_cross_validation", "rms_fit", "rms_repeatability")
+    rows, moved = [], []
+    for j, a in enumerate(section.actuators):
+        shares = [getattr(a, which) / a.rms_effort if a.rms_effort > 0 else 0.0 for which in errors]
+        shares += [float(ratio[j]) for ratio in others.values()]
+        if a.rms_effort > 0:
+            moved.append(shares)
+        cells = (percent(share) if share > 0 else "" for share in shares)
+        rows.append((a.name, _label(verdicts[a.name]), f"{a.rms_effort:.4f}", *cells))
+    means = np.mean(moved, axis=0) if moved else np.zeros(3 + len(others))
+    rows.append(("mean", "", "", *(percent(mean) if mean > 0 else "" for mean in means)))
     several = f"{len(result.motions)} recordings, " if len(result.motions) > 1 else ""
-    title = f"{result.model.arm.name}, {several}{result.num_rows} rows of motion: effort and relative error (RMS)"
-    columns = ("", "effort [N m; N]", "fit error", "cross-validation error", "repeatability", "verdict")
-    table = make_table(title, *columns)
-    table.columns[-1].justify = "left"
-    errors = ("rms_fit", "rms_cross_validation", "rms_repeatability")
-    shares = {
-        a.name: [getattr(a, which) / a.rms_effort if a.rms_effort > 0 else 0.0 for which in errors]
-        for a in section.actuators
-    }
-    for a in section.actuators:
-        verdict = verdicts[a.name]
-        cells = (percent(share) if share > 0 else "" for share in shares[a.name])
-        table.add_row(a.name, f"{a.rms_effort:.4f}", *cells, verdict, style=_STYLES.get(verdict, ""))
-    moved = [shares[a.name] for a in section.actuators if a.rms_effort > 0]
-    means = np.mean(moved, axis=0) if moved else np.zeros(3)
-    table.add_row("mean", "", *(percent(mean) if mean > 0 else "" for mean in means), "")
-    console.print(table)
+    header = ("effort [N m; N]", "cross-validation error", "fit error", "repeatability", *others)
+    how = "6 folds over the phase of the motion; effects, base tilt and parameters are estimated anew in each fold"
     if several:
-        console.print()
-        _print_error_of_each_recording(console, result)
+        how = "each recording is predicted by a model of the others, with the mean of their offsets and friction"
+    blocks: list[Block] = [
+        _table(header, rows, f"{several}{result.num_rows} rows of motion: actuator effort and relative error (RMS)"),
+        Text(
+            f"Low-pass filter of the efforts: {section.signals.effort_cut_off:g} Hz. Cross-validation: {how}. On "
+            "another recording the error can be larger, because friction changes from day to day. Repeatability: "
+            "difference between periods of the motion. The fit error can be smaller than the repeatability if the "
+            "periods of the executed motion differ.",
+            show="details",
+        ),
+    ]
+    if several:
+        blocks += _error_of_each_recording(result)
     tilt = np.degrees(_angle(np.array(section.gravity), np.array(section.gravity_expected)))
     if tilt > 0.1:
         gravity = ", ".join(f"{x:.3f}" for x in section.gravity)
-        console.print(
-            f"The base is tilted by {tilt:.1f} deg. Gravity in the base frame: {gravity} m/s^2.", markup=False
-        )
-    console.print()
+        blocks.append(Text(f"The base is tilted by {tilt:.1f} deg. Gravity in the base frame: {gravity} m/s^2."))
+    return blocks
 
 
-def _print_error_of_each_recording(console: Console, result: DynamicIdentification) -> None:
-    names = [Path(motion.recording.source).name or "recording" for motion in result.motions]
-    table = make_table("Relative error of each recording, predicted by a model of the others", "", *names)
+def _error_of_each_recording(result: DynamicIdentification) -> list[Block]:
+    names = [_name(motion.recording) for motion in result.motions]
     errors = np.column_stack([motion.held_out_errors for motion in result.motions])
-    for name, row in zip(result.model.arm.joint_names, errors, strict=True):
-        table.add_row(name, *(percent(error) if np.isfinite(error) else "" for error in row))
-    table.add_row("mean", *map(percent, np.nanmean(errors, axis=0)))
-    console.print(table)
-    print_note(console, f"The intervals include only the differences between these {len(names)} recordings.")
+    rows = [
+        (name, *(percent(error) if np.isfinite(error) else "" for error in row))
+        for name, row in zip(result.model.arm.joint_names, errors, strict=True)
+    ]
+    rows.append(("mean", *map(percent, np.nanmean(errors, axis=0))))
+    caption = "Relative error of each recording, predicted by a model of the others"
+    note = f"The intervals include only the differences between these {len(names)} recordings."
+    return [Table(("", *names), rows, caption, note, right=[False, *len(names) * [True]])]
 
 
-def _print_motion_details(console: Console, result: DynamicIdentification) -> None:
-    """Prints each parameter with its standard error."""
-    section = result.model.dynamic_model.section
-    how = "6 folds over the phase of the motion; effects, base tilt and parameters are estimated anew in each fold"
-    if len(result.motions) > 1:
-        how = "each recording is predicted by a model of the others, with the mean of their offsets and friction"
-    print_note(
-        console,
-        f"Low-pass filter of the efforts: {section.signals.effort_cut_off:g} Hz. Cross-validation: {how}. On another "
-        "recording the error can be larger, because friction changes from day to day. Repeatability: difference "
-        "between periods of the motion. The fit error can be smaller than the repeatability if the periods of the "
-        "executed motion differ.",
-    )
-    _print_links(console, section, result.nominal_mass)
-    _print_base_parameters(console, section)
-    _print_correlations(console, section.correlations)
-    _print_drive(console, section, result.dry_friction)
-    _print_effects(console, section)
-
-
-def _print_links(console: Console, section: DynamicSection, nominal_mass: float) -> None:
-    table = make_table("Links, centre of mass in the link frame", "", "mass [kg]", "+-", "centre of mass [m]", "+-", "")
-    table.columns[0].no_wrap, table.columns[-1].no_wrap = True, False
-    for link in section.links:
-        m, *h = link.parameters[:4]
-        com = np.array(h) / m
-        errors = np.array(link.standard_errors[:4])
-        # First-order propagation of independent errors of mass and first moments.
-        spread = float(np.max(np.hypot(errors[1:], com * errors[0]))) / m
-        remark = (
-            "; ".join(link.bounds) + " *" if link.bounds else ("SDF's mass" if link.mass_identifiability < 0.5 else "")
+def _identified_poses(result: StaticIdentification, efforts: Efforts) -> list[Block]:
+    verdicts, others = cross_validated_verdicts(result.model), _baseline_ratios(efforts)
+    rows, details = [], []
+    for j, own in enumerate(result.model.joints):
+        torque, error = own.rms_zero_torque_included, own.rms_cross_validation_included
+        rows.append(
+            (
+                own.name,
+                _label(verdicts[own.name]),
+                *(f"{torque:.4f}", f"{error:.4f}", _ratio(error, torque)),
+                *(f"{ratio[j]:.2f}" for ratio in others.values()),
+                *(f"{own.feedforward_scale:.2f}", f"{100 * own.coverage:.0f} %"),
+            )
         )
-        place = ", ".join(f"{x:+.3f}" for x in com)
-        table.add_row(link.link, f"{m:.4g}", f"{errors[0]:.1g}", place, f"{spread:.1g}", remark)
-    total = sum(link.parameters[0] for link in section.links)
-    reached = total_mass_reached(total, nominal_mass)
-    table.add_row("all", f"{total:.4g}", "", "", "", f"SDF: {nominal_mass:.4g}" + " *" * reached)
-    console.print(table)
-    if reached or any(link.bounds for link in section.links):
-        console.print("* The estimate is at its bound, so the recording does not determine the value.", style="yellow")
-    print_note(
-        console,
-        "+-: standard error. Base parameters combine parameters of several links. A motion determines the base "
-        "parameters more accurately than the parameters of one link.",
-    )
-
-
-def _print_base_parameters(console: Console, section: DynamicSection) -> None:
-    table = make_table("Base parameters of the dynamics", "", "value", "+-", "unit", "")
-    table.columns[0].max_width = _NAME_WIDTH
-    for p in section.base_parameters:
-        remark = "" if p.identifiability >= MIN_IDENTIFIABILITY else "from the SDF"
-        if not remark and abs(p.value) < half_width(p.standard_error, section.degrees_of_freedom):
-            remark = "zero?"
-        table.add_row(escape(p.name), f"{p.value:+.3g}", f"{p.standard_error:.1g}", p.unit, remark)
-    console.print(table)
-    print_note(
-        console,
-        "from the SDF: the motion does not determine this parameter. zero?: the 95 % interval contains 0.",
-    )
-
-
-def _print_correlations(console: Console, pairs: Sequence[CorrelatedEstimates]) -> None:
-    for pair in pairs:
-        what = "difference" if pair.correlation > 0 else "sum"
-        console.print(
-            f"not identifiable separately: {pair.first} and {pair.second} (correlation {pair.correlation:+.3f}). Only "
-            f"a scaled {what} is identifiable.",
-            style="yellow",
-            markup=False,
-        )
-    if pairs:
-        console.print()
-
-
-def _print_drive(console: Console, section: DynamicSection, dry: dict[str, tuple[float, float]]) -> None:
-    table = make_table(
-        "Friction and offset [N m, N m s/rad; N, N s/m]", "", "dry", "+-", "viscous", "+-", "offset", "+-"
-    )
-    for name in dict.fromkeys([*dry, *(e.coordinate for e in section.effects)]):
-        cells = [f"{dry[name][0]:.3g}", f"{dry[name][1]:.1g}"] if name in dry else ["", ""]
-        for kind in ("viscous", "offset"):
-            found = next((e for e in section.effects if e.coordinate == name and e.kind == kind), None)
-            cells += ["", ""] if found is None else [f"{found.coefficient:.3g}", f"{found.standard_error:.1g}"]
-        table.add_row(name, *cells)
-    console.print(table)
-    console.print()
-
-
-def _print_effects(console: Console, section: DynamicSection) -> None:
-    table = make_table("Rotor inertias and joint effects", *_EFFECT_COLUMNS)
-    for rotor in section.rotors:
-        row = (f"{rotor.value:.3g}", f"{rotor.standard_error:.1g}", "kg m^2")
-        table.add_row(f"actuator.{rotor.actuator}", "rotor", "", *row)
-    for e in sorted(section.effects, key=lambda e: (e.coordinate, e.kind, e.scale)):
-        table.add_row(*_effect_cells(e))
-    console.print(table)
-
-
-def _effect_cells(e: DriveEffect) -> tuple[str, ...]:
-    scale = f"{e.scale:.2g}" if e.scale else ""
-    return e.coordinate, e.kind, scale, f"{e.coefficient:+.3g}", f"{e.standard_error:.1g}", EFFECT_KINDS[e.kind].unit
-
-
-def _print_pose_errors(
-    console: Console, result: StaticIdentification, verdicts: Mapping[str, Verdict], verbose: bool
-) -> None:
-    joints, poses = result.model.joints, len(result.recording)
-    title = f"{result.model.arm.name}, {poses} static poses: RMS effort and cross-validation error [N m; N]"
-    columns = ("measured", "error", "ratio", "feedforward scale", "range covered", "verdict")
-    table = make_table(title, "", *columns)
-    table.columns[-1].justify = "left"
-    for j in joints:
-        torque, error, verdict = j.rms_zero_torque_included, j.rms_cross_validation_included, verdicts[j.name]
-        table.add_row(
-            *(j.name, f"{torque:.4f}", f"{error:.4f}", f"{error / torque:.2f}" if torque > 0 else ""),
-            *(f"{j.feedforward_scale:.2f}", f"{100 * j.coverage:.0f} %", verdict),
-            style=_STYLES.get(verdict, ""),
-        )
-    console.print(table)
-    if num_excluded := sum(j.num_excluded for j in joints):
-        lists = "" if verbose else " --verbose lists them."
-        console.print(f"{num_excluded} of {result.usable.size} measurements were excluded.{lists}")
+        errors = (own.rms_fit_included, own.rms_leave_one_out_included)
+        with_excluded = (own.rms_zero_torque, own.rms_fit, own.rms_leave_one_out)
+        positions = f"{own.position_lower:+.2f}..{own.position_upper:+.2f}"
+        details.append((own.name, *(f"{e:.4f}" for e in (*errors, *with_excluded)), positions))
+    poses = len(result.recording)
+    header = ("effort", "error", "ratio", *others, "feedforward scale", "range covered")
+    fits = ("", "fit", "leave-one-out", "zero torque*", "fit*", "leave-one-out*", "positions [rad; m]")
+    blocks: list[Block] = [
+        _table(header, rows, f"{poses} static poses: RMS joint effort, cross-validation error [N m; N] and ratio"),
+        Text(
+            "Cross-validation error: 10 folds over the poses. Effects, parameters and feedforward scales are estimated "
+            "anew in each fold. The effort is the error of zero torque.",
+            show="details",
+        ),
+        Table(fits, details, "RMS error [N m; N] (* including the excluded measurements)", show="details"),
+    ]
+    if count := sum(joint.num_excluded for joint in result.model.joints):
+        text = f"{count} of {result.usable.size} measurements were excluded."
+        blocks += [Text(f"{text} --verbose lists them.", show="brief"), Text(text, show="details")]
     if poses < result.num_rows:
-        console.print(f"The {result.num_rows} rows contain {poses} distinct poses. Samples of one pose were averaged.")
-    for j in joints:
-        if j.feedforward_scale == 0.0:
+        text = f"The {result.num_rows} rows contain {poses} distinct poses. Samples of one pose were averaged."
+        blocks.append(Text(text))
+    for own in result.model.joints:
+        if own.feedforward_scale == 0.0:
             why = "the recording does not separate gravity from friction."
-            if j.rms_zero_torque == 0.0:
+            if own.rms_zero_torque == 0.0:
                 why = "its effort was not measured."
-            console.print(f"{j.name}: feedforward disabled, because {why}", style="yellow", markup=False)
-    console.print()
+            blocks.append(Text(f"{own.name}: feedforward disabled, because {why}", "warning"))
+    return blocks
 
 
-def _print_pose_details(console: Console, result: StaticIdentification) -> None:
-    """Prints the excluded measurements, the parameters with standard errors, and the errors of each joint."""
-    print_note(
-        console,
-        "Cross-validation error: 10 folds over the poses. Effects, parameters and feedforward scales are estimated "
-        "anew in each fold.",
-    )
-    _print_excluded(console, result.excluded)
-    print_static_parameters(console, result.model)
+def _validated_motion(validation: DynamicValidation, efforts: Efforts) -> list[Block]:
+    others, rows = _baseline_ratios(efforts), []
+    for j, a in enumerate(validation.actuators):
+        shares = (a.relative_error, a.repeatability, a.inside, a.inside_other_day)
+        cells = [*("" if x is None else percent(x) for x in shares), *(percent(ratio[j]) for ratio in others.values())]
+        rows.append((a.name, _label(a.verdict), f"{a.rms_effort:.4f}", f"{a.rms_error:.4f}", *cells))
+    means = [percent(float(np.mean(ratio[ratio > 0]))) if np.any(ratio > 0) else "" for ratio in others.values()]
+    rows.append(("mean", "", "", "", percent(validation.mean_relative_error), "", "", "", *means))
+    header = ("effort", "error", "ratio", "repeatability", "inside", "other day", *others)
+    name = _name(validation.recording)
+    return [
+        _table(header, rows, f"Motion of {name}: RMS actuator effort and error [N m; N], relative error"),
+        Text(
+            "inside: share of the measured efforts inside the prediction interval of the same day. other day: inside "
+            f"the interval of another day. {validation.model.interval_scope}",
+            show="details",
+        ),
+        Text(f"{rule_text()} Low-pass filter: {validation.cut_off:g} Hz.", show="details"),
+    ]
 
 
-def print_static_parameters(console: Console, model: IdentifiedModel) -> None:
-    """Prints the parameters of a static model with standard errors, then the errors of each joint."""
-    provenance = model.provenance
-    table = make_table("Base parameters of gravity", "", "value", "standard error", "unit", "")
-    units = gravity_parameters(model.arm).base.units
-    for p, unit in zip(model.base_parameters, units, strict=True):
-        zero = "" if p.distinguishable else "zero?"
-        table.add_row(escape(p.name), f"{p.value:+.5f}", f"{p.standard_error:.5f}", unit, zero)
-    console.print(table)
-    print_note(
-        console,
-        f"Method {provenance.method}, rank {provenance.rank} of {len(model.base_parameters)}, condition number "
-        f"{provenance.condition_number:.3g}. zero?: the 95 % interval contains 0.",
-    )
-    if model.effects:
-        table = make_table("Joint effects [N m; N]", "", "value", "standard error", "")
-        for e in model.effects:
-            numbers = (f"{e.coefficient:+.5f}", f"{e.standard_error:.5f}", "" if e.distinguishable else "zero?")
-            table.add_row(str(ActuatorEffect.of(e)), *numbers)
-        console.print(table)
-        console.print()
-    title = "RMS error [N m; N] (* including the excluded measurements)"
-    table = make_table(
-        title, "", "fit", "leave-one-out", "zero torque*", "fit*", "leave-one-out*", "positions [rad; m]"
-    )
-    for j in model.joints:
-        own = (j.rms_fit_included, j.rms_leave_one_out_included)
-        errors = (*own, j.rms_zero_torque, j.rms_fit, j.rms_leave_one_out)
-        positions = f"{j.position_lower:+.2f}..{j.position_upper:+.2f}"
-        table.add_row(j.name, *(f"{e:.4f}" for e in errors), positions)
-    console.print(table)
-    console.print()
-
-
-def _print_excluded(console: Console, excluded: Sequence[ExcludedMeasurement]) -> None:
-    if not excluded:
-        return
-    console.print(f"Excluded measurements in {len({d.where for d in excluded})} poses:", style="yellow")
-    for measurement in excluded:
-        console.print(f"  {measurement.where}: {measurement.reason}", style="yellow", markup=False)
-    console.print()
-
-
-def _print_motion_validation(console: Console, validation: DynamicValidation, verbose: bool) -> None:
-    name = Path(validation.recording.source).name or "recording"
-    title = f"{validation.model.arm.name}, motion of {name}: RMS effort and error [N m; N]"
-    table = make_table(title, "", "effort", "error", "ratio", "repeatability", "inside", "other day", "verdict")
-    table.columns[-1].justify = "left"
-    for a in validation.actuators:
-        shares = (
-            "" if x is None else percent(x) for x in (a.relative_error, a.repeatability, a.inside, a.inside_other_day)
-        )
-        style = _STYLES.get(a.verdict, "")
-        table.add_row(a.name, f"{a.rms_effort:.4f}", f"{a.rms_error:.4f}", *shares, a.verdict, style=style)
-    table.add_row("mean", "", "", percent(validation.mean_relative_error), "", "", "", "")
-    console.print(table)
-    console.print()
-    if not verbose:
-        return
-    print_note(
-        console,
-        "inside: share of the measured efforts inside the prediction interval of the same day. other day: inside the "
-        f"interval of another day. {validation.model.interval_scope}",
-    )
-    print_note(console, f"{rule_text()} Low-pass filter: {validation.cut_off:g} Hz.")
-    table = make_table("Largest shares of the squared error", "", "share", "cause", "share", "cause")
-    for a in validation.actuators:
-        causes = [(share, label) for share, label in zip(a.shares, SHARE_LABELS, strict=True) if share is not None]
-        largest = sorted(causes, reverse=True)[:2]
-        table.add_row(a.name, *chain.from_iterable((f"{100 * share:.0f} %", label) for share, label in largest))
-    for column in (2, 4):
-        table.columns[column].justify = "left"
-    console.print(table)
-    print_note(
-        console,
-        "If the share of the bias or of the friction-like error is large, recalibrate. A large position-dependent "
-        "share indicates that the cables changed. No model reduces the share that does not repeat between periods. "
-        "--report shows all shares.",
-    )
-
-
-def _print_pose_validation(console: Console, validation: StaticValidation, verbose: bool) -> None:
-    name = Path(validation.recording.source).name or "recording"
-    title = f"{validation.model.arm.name}, {validation.poses} poses of {name}: RMS effort and error [N m; N]"
-    table = make_table(title, "", "measured", "error", "ratio", "excluded", "verdict")
-    table.columns[-1].justify = "left"
-    for j in validation.joints:
-        ratio = "" if j.relative_error_included is None else f"{j.relative_error_included:.2f}"
-        numbers = (f"{j.rms_torque_included:.4f}", f"{j.rms_error_included:.4f}", ratio, f"{j.num_excluded or ''}")
-        table.add_row(j.name, *numbers, j.verdict, style=_STYLES.get(j.verdict, ""))
-    console.print(table)
-    console.print()
-    if not verbose:
-        return
-    print_note(console, rule_text())
+def _validated_poses(validation: StaticValidation, efforts: Efforts) -> list[Block]:
+    others, rows, every = _baseline_ratios(efforts), [], []
+    for j, own in enumerate(validation.joints):
+        numbers = (f"{own.rms_torque_included:.4f}", f"{own.rms_error_included:.4f}")
+        ratio = _ratio(own.rms_error_included, own.rms_torque_included)
+        ratios = (f"{other[j]:.2f}" for other in others.values())
+        rows.append((own.name, _label(own.verdict), *numbers, ratio, *ratios, f"{own.num_excluded or ''}"))
+        all_ratio = "" if own.relative_error is None else f"{own.relative_error:.2f}"
+        every.append((own.name, f"{own.rms_torque:.4f}", f"{own.rms_error:.4f}", all_ratio))
+    name, header = _name(validation.recording), ("effort", "error", "ratio", *others, "excluded")
+    blocks: list[Block] = [
+        _table(header, rows, f"{validation.poses} poses of {name}: RMS joint effort and error [N m; N], ratio"),
+        Text(rule_text(), show="details"),
+    ]
     if validation.excluded:
-        table = make_table("RMS effort and error [N m; N], all measurements", "", "measured", "error", "ratio")
-        for j in validation.joints:
-            ratio = "" if j.relative_error is None else f"{j.relative_error:.2f}"
-            table.add_row(j.name, f"{j.rms_torque:.4f}", f"{j.rms_error:.4f}", ratio)
-        console.print(table)
-        console.print()
-    _print_excluded(console, validation.excluded)
+        caption = "RMS effort and error [N m; N], all measurements"
+        blocks.append(Table(("", "effort", "error", "ratio"), every, caption, show="details"))
+    return blocks
+
+
+def _remarks(result: Result) -> list[Block]:
+    """Returns the joints with a small covered range, the locked joints, and the warnings about the recording."""
+    blocks: list[Block] = []
+    if isinstance(result, StaticValidation | DynamicValidation):
+        judged = result.joints if isinstance(result, StaticValidation) else result.actuators
+        verdicts, covered = result.verdicts, [joint.coverage for joint in judged]
+    else:
+        verdicts, covered = cross_validated_verdicts(result.model), identified_coverage(result.model).tolist()
+    few = [
+        name
+        for (name, verdict), share in zip(verdicts.items(), covered, strict=True)
+        if verdict == "usable" and share < MIN_COVERAGE
+    ]
+    if few:
+        limit = f"less than {100 * MIN_COVERAGE:g} % of the range (at most 180 deg) is covered"
+        blocks.append(Text(f"At most usable, because {limit}: {', '.join(few)}."))
+    arm = result.model.arm
+    if arm.locked_joints:
+        blocks.append(
+            Text(
+                f"Not in the recording: {', '.join(arm.locked_joints)}. The model is valid only for {arm.locked_text} "
+                "[rad, m], and it has no efforts of these joints.",
+                "warning",
+            )
+        )
+    for finding in result.warnings:
+        if finding.severity == "warning":
+            text = f"{finding.where}: {finding.what}. {finding.advice}".rstrip()
+            blocks.append(Text(text, "warning", show="page"))
+    return blocks
+
+
+def _effort_sections(efforts: Efforts, name: str, suffix: str) -> list[Section]:
+    """Returns the sections on the efforts and errors of one recording, with its name unless it is the only one."""
+    of = f": {name}" if name else ""
+    views = [] if suffix else [_view(efforts)]
+    blocks: list[Block] = [*views, efforts_plot(efforts, f"efforts{suffix}", time=not suffix)]
+    if efforts.v is None:
+        blocks.append(predicted_plot(efforts))
+    note = (
+        "Predicted: efforts of the model for the positions of this recording."
+        if efforts.judged == "predicted"
+        else "Fitted: model identified from all data. Held out: prediction of a model that was identified without the "
+        "fold of the data that it predicts."
+    )
+    if efforts.v is not None:
+        note += f" {efforts.model.interval_scope}"
+    causes = "offset, first and second harmonic of the position, load"
+    if efforts.v is not None:
+        causes = "offset, friction and position of the actuator, accelerations, positions of the other actuators"
+    budget_note = (
+        f"Each bar is divided by shares of the squared error. The causes are fitted in this order: {causes}. Each "
+        "share is the additional reduction of the squared error."
+    )
+    if efforts.v is not None:
+        budget_note += (
+            " The remaining error has three parts: differences between periods, frequencies above 2 Hz, and other. If "
+            "the share of the bias or of the friction-like error is large, recalibrate. No model reduces the share "
+            "that does not repeat between periods."
+        )
+    return [
+        Section(f"Measured and predicted efforts{of}", blocks, note),
+        Section(f"Residuals{of}", [residuals_plot(efforts, f"residuals{suffix}")]),
+        Section(
+            f"Error budget{of}", [budget_plot(efforts, f"error_budget{suffix}"), structure_table(efforts)], budget_note
+        ),
+    ]
+
+
+def _view(efforts: Efforts) -> Scene:
+    arm = efforts.arm
+    if (grid := efforts.grid) is not None:
+        tau = efforts.recording.in_joint_coordinates(arm).measured_effort()
+
+        def html() -> str:
+            on_grid = np.column_stack([np.interp(grid.t, grid.row_times, x) for x in tau.T])
+            return playback(arm, grid.t - grid.row_times[0], grid.q, on_grid)
+
+        start = float(grid.t[0] - grid.row_times[0])
+        return Scene(html, "Recorded motion. Click a plot to move the arm to this time.", start)
+    poses = efforts.recording.in_joint_coordinates(arm)
+    caption = "Recorded poses, one per second. Click a plot to show a pose."
+    return Scene(lambda: playback(arm, efforts.x, poses.q, poses.measured_effort()), caption, 1.0)
+
+
+def _data_quality(result: Result, efforts: Efforts) -> list[Block]:
+    """Returns the covered ranges, the notes on reading, and the rows and measurements that were not used."""
+    arm, recording = result.model.arm, result.recording
+    q = recording.in_joint_coordinates(arm).q
+    rows = []
+    for j, name in enumerate(arm.joint_names):
+        lower, upper = float(q[:, j].min()), float(q[:, j].max())
+        limits = f"{arm.position_lower[j]:.3g} .. {arm.position_upper[j]:.3g}"
+        share = (upper - lower) / (arm.position_upper[j] - arm.position_lower[j])
+        cells = [name, length_unit(arm, j), limits, f"{lower:.3g} .. {upper:.3g}", f"{100 * share:.0f} %"]
+        if efforts.v is not None and efforts.grid is not None:
+            v = efforts.grid.v[:, j]
+            cells += [f"{np.sqrt(np.mean(v**2)):.3g}", f"{np.abs(v).max():.3g}"]
+        rows.append(tuple(cells))
+    speeds = () if efforts.v is None else ("RMS speed [1/s]", "peak speed [1/s]")
+    header = ("joint", "unit", "position limits", "recorded", "covered", *speeds)
+    right = [False, False, *(len(header) - 2) * [True]]
+    blocks: list[Block] = [
+        Table(header, rows, "Positions of the joints in the recording", show="page", right=right),
+        *(Text(f"Reading: {note}", show="page") for note in recording.notes),
+    ]
+    if not any(finding.severity == "warning" for finding in result.warnings):
+        blocks.append(Text("The check of the recording reported no warnings.", "good", show="page"))
+    if efforts.grid is not None:
+        count, distinct = len(recording), len(efforts.grid.clock.rows)
+        text = f"{len(efforts.x)} of {count} rows were compared. Both ends were omitted because of filter transients."
+        repeated = f" {count - distinct} rows repeat the previous row and were not used." if distinct < count else ""
+        blocks.append(Text(text + repeated, show="page"))
+    if efforts.excluded:
+        listed = [(measurement.where, measurement.reason) for measurement in efforts.excluded]
+        caption = f"Excluded measurements in {len({m.where for m in efforts.excluded})} poses"
+        blocks.append(Table(("pose", "reason"), listed, caption, show="details", folded=len(listed) > 8))
+    return blocks
+
+
+def recalibration_page(result: Recalibration, *, model_path: str = "MODEL.yaml") -> Page:
+    """Returns the errors before and after the refit, and the change of friction and offsets.
+
+    Args:
+        result: Result of the recalibration.
+        model_path: Path of the new model, for the suggested next command.
+    """
+    before, after = (float(np.mean([getattr(a, which) for a in result.actuators])) for which in ("before", "after"))
+    rows = []
+    for a in result.actuators:
+        new = [_factor(a.dry), _factor(a.viscous), f"{a.offset:+.4f}"] if a.kept else ["", "", ""]
+        rows.append((a.name, percent(a.before), percent(a.after), *new, a.reason))
+    rows.append(("mean", percent(before), percent(after), "", "", "", ""))
+    errors, changes = ("error before", "error after"), ("dry friction factor", "viscous factor")
+    header = ("", *errors, *changes, "offset change [N m; N]", "unchanged because")
+    caption = f"{result.seconds:.1f} s of motion: effort error, change of friction and offset"
+    blocks: list[Block] = [
+        Table(header, rows, caption, right=[False, *5 * [True], False]),
+        Text(
+            "The improvement is valid for similar motions. At other positions and speeds, the improvement can be much "
+            "smaller. Validate the new model on the motion that you need."
+        ),
+        Text(
+            "Error: RMS(measured - predicted effort) / RMS(measured effort), after the low-pass filter of the model. "
+            f"Error after: {FOLDS}-fold cross-validation over the motion. Factors and offsets: fit to all rows.",
+            show="details",
+        ),
+    ]
+    if result.shared:
+        shared = ", ".join(f"{name} x {scale:.2f}" for name, scale in result.shared.items())
+        blocks.append(Text(f"Factors of friction that acts on several actuators: {shared}", show="details"))
+    kept = sum(a.kept for a in result.actuators)
+    return Page(
+        f"{result.model.arm.name}: recalibration",
+        f"Mean effort error {percent(before)} before and {percent(after)} after the refit, cross-validated; "
+        f"{kept} of {len(result.actuators)} actuators refitted.",
+        [Section("Errors", blocks)],
+        "good",
+        f"dvrk-drake validate OTHER.csv --model {model_path} --save",
+    )
 
 
 def _factor(factor: float | None) -> str:

@@ -17,10 +17,10 @@ _MAKERS = {
     "CompensationComparison": ("export", "compensation_page"),
     "PayloadIdentification": ("payload", "payload_page"),
     "Tuning": ("tuning", "tuning_page"),
-    "DynamicIdentification": ("html.identification", "identification_page"),
-    "DynamicValidation": ("html.identification", "identification_page"),
-    "StaticIdentification": ("html.identification", "identification_page"),
-    "StaticValidation": ("html.identification", "identification_page"),
+    "DynamicIdentification": ("identification", "identification_page"),
+    "DynamicValidation": ("identification", "identification_page"),
+    "StaticIdentification": ("identification", "identification_page"),
+    "StaticValidation": ("identification", "identification_page"),
 }
 
 
@@ -54,9 +54,5 @@ def write_report(
     if name not in _MAKERS:
         raise DvrkDrakeError(f"there is no report for {name}; allowed: {', '.join(sorted(_MAKERS))}")
     module, function = _MAKERS[name]
-    make = getattr(import_module(f"dvrk_drake.reports.{module}"), function)
-    if module.startswith("html."):
-        make(result, Provenance.of(inputs, command)).write(path)
-        return
-    page = make(result)
+    page = getattr(import_module(f"dvrk_drake.reports.{module}"), function)(result)
     write_html(page, path, Provenance.of(inputs, command))

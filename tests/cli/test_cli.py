@@ -59,7 +59,7 @@ def test_identify_writes_files_and_prints_parameters(folder, identified_poses, t
     assert np.sqrt(np.mean(error[:, 1:6] ** 2, axis=0)).max() < 0.005
     # The function gives the same model.
     np.testing.assert_allclose(model.theta, identified_poses.result.model.theta, rtol=1e-6, atol=1e-9)
-    assert {p.name for p in plots.iterdir()} == {"torque_error.png", "predicted.png"}
+    assert {p.name for p in plots.iterdir()} == {"efforts.png", "predicted.png", "residuals.png", "error_budget.png"}
 
 
 def test_validate_writes_json(folder, capsys):

@@ -3,7 +3,6 @@
 import csv
 import dataclasses
 import re
-from base64 import b64encode
 from concurrent.futures import ThreadPoolExecutor
 from typing import get_args, get_type_hints
 
@@ -46,6 +45,9 @@ from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_selector
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.reports.colours import MEASURED
+from dvrk_drake.reports.page import Plot
+from dvrk_drake.reports.plot import Curve, Panel
 from dvrk_drake.reports.provenance import Provenance
 from dvrk_drake.reports.reproduction import run
 from dvrk_drake.reports.reproduction.drift import reproduce_figure_5
@@ -156,11 +158,11 @@ def test_rejects_unknown_figures(tmp_path):
 
 def test_page_links_its_tables_and_figures(tmp_path):
     table = ResultTable("numbers", "Numbers", ("", "J1"), (("ours", "1"), ("theirs", "a, b")))
-    (tmp_path / "x.png").write_bytes(b"picture")
-    section = Section("x", "Fig. 9: a, b", "Found.", ("**Said** `so`.",), (table,), {"x.png": "Seen"})
+    plot = Plot("x", "Seen", [Panel("", [Curve("", [0, 1], [0, 1], MEASURED)], "q [rad]", "tau [N m]")])
+    section = Section("x", "Fig. 9: a, b", "Found.", ("**Said** `so`.",), (table,), (plot,))
     text = write_page(tmp_path, [section], ["a reason"], Provenance.of()).read_text()
     assert '<a href="#section-2">Fig. 9: a, b</a>' in text
-    assert f'alt="Seen" src="data:image/png;base64,{b64encode(b"picture").decode()}"' in text
+    assert "<figcaption>Seen</figcaption>" in text and (tmp_path / "x.png").read_bytes().startswith(b"\x89PNG")
     assert text.index("Found.") < text.index("numbers.csv") < text.index("<strong>Said</strong> <code>so</code>.")
     assert "1 of 2 requested results were computed." in text and "Missing: a reason" in text
     assert "reproduce all --folder reproduction --data FOLDER" in text
@@ -309,8 +311,8 @@ def test_figure_5_writes_files_and_exact_model_holds(truth, tmp_path):
     with ThreadPoolExecutor(1) as executor:
         section = reproduce_figure_5(exact_session(truth, tmp_path, executor, sample_sizes))
     page = write_page(tmp_path, [section], [], Provenance.of()).read_text()
-    assert len(section.figures) == 2
-    assert all((tmp_path / figure).read_bytes().startswith(b"\x89PNG") for figure in section.figures)
+    assert len(section.plots) == 2
+    assert all((tmp_path / f"{plot.name}.png").read_bytes().startswith(b"\x89PNG") for plot in section.plots)
     drift = {row[0]: row[1:] for row in section.tables[0].rows}
     assert [float(x) for x in drift["published, five trials (mean)"][1:]] == list(published.FIGURE_5_MEANS)
     assert drift["ours, share held"] == ("1.000",) * 7

@@ -22,10 +22,10 @@ from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensa
 from dvrk_drake.reports import (
     demo,
     export,
-    identification,
     recording_check,
     simulation,
 )
+from dvrk_drake.reports.identification import identification_page, recalibration_page
 from dvrk_drake.reports.model import symbolic_model_page
 from dvrk_drake.reports.payload import payload_page
 from dvrk_drake.reports.study import study_page
@@ -123,21 +123,19 @@ def demonstrated(console, verbose):
 VERDICT = r"Verdict: (good|usable|do not use) ?[(.]"
 #: Mapping from a case to a pattern for the start of the answer, and the function that prints it.
 CASES = {
-    "identify poses": (VERDICT, lambda c, v: identification.print_identification(c, poses()[0], verbose=v)),
-    "identify motion": (VERDICT, lambda c, v: identification.print_identification(c, motions()[2], verbose=v)),
+    "identify poses": (VERDICT, lambda c, v: print_page(c, identification_page(poses()[0]), verbose=v)),
+    "identify motion": (VERDICT, lambda c, v: print_page(c, identification_page(motions()[2]), verbose=v)),
     "validate poses": (
         r"Verdict: do not use \(elbow_pitch\)\. Largest error: \d+\.\d % of the effort limit",
-        lambda c, v: identification.print_validation(c, poses()[1], verbose=v),
+        lambda c, v: print_page(c, identification_page(poses()[1]), verbose=v),
     ),
     "validate motion": (
         VERDICT,
-        lambda c, v: identification.print_validation(c, dvrk.validate(motions()[2].model, motions()[1]), verbose=v),
+        lambda c, v: print_page(c, identification_page(dvrk.validate(motions()[2].model, motions()[1])), verbose=v),
     ),
     "recalibrate": (
         r"Mean effort error \d+\.\d % before and \d+\.\d % after the refit",
-        lambda c, v: identification.print_recalibration(
-            c, dvrk.recalibrate(motions()[2].model, motions()[1]), verbose=v
-        ),
+        lambda c, v: print_page(c, recalibration_page(dvrk.recalibrate(motions()[2].model, motions()[1])), verbose=v),
     ),
     "check": (r"Verdict: usable", checked),
     "check, refused": (

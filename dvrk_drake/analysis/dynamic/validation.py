@@ -184,7 +184,7 @@ def validate_motion(model: IdentifiedModel, observations: Observations) -> Dynam
     dynamics = model.dynamic_model
     arm = model.arm
     tau, grid, period = observations.tau, observations.grid, observations.period
-    measured, predicted = (grid.filter_efforts(x @ grid.channels.T) for x in (tau, _efforts(model, grid)))
+    measured, predicted = grid.filter_efforts(tau @ grid.channels.T), filtered_efforts(model, grid)
     t, a, v = grid.actuator_motion()
     floor: list[float | None] = [None] * arm.num_joints
     if period is not None:
@@ -233,6 +233,11 @@ def find_other_robot(validation: DynamicValidation) -> tuple[Finding, ...]:
     what = "the errors of the model are much larger than expected for another day of the same arm"
     advice = "Usual causes: another individual arm or instrument, a payload, or a changed drive. Identify it again."
     return (Finding("warning", "other robot", ", ".join(bad), what, advice),)
+
+
+def filtered_efforts(model: IdentifiedModel, grid: MotionGrid) -> NDArray[np.float64]:
+    """Returns the predicted efforts (r, n) of the channels of a motion without both ends, after low-pass filtering."""
+    return grid.filter_efforts(_efforts(model, grid) @ grid.channels.T)
 
 
 def _efforts(model: IdentifiedModel, grid: MotionGrid) -> NDArray[np.float64]:

@@ -18,14 +18,8 @@ from dvrk_drake.experiments.tuning.model_based import friction
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import EFFECT_NAMES
 from dvrk_drake.reports.colours import FITTED, LIMIT, MEASURED, REFERENCE
-from dvrk_drake.reports.figures.style import (
-    add_legend,
-    joint_title,
-    panel_grid,
-    position_unit,
-    save_figure,
-    set_title,
-)
+from dvrk_drake.reports.page import Plot
+from dvrk_drake.reports.plot import Curve, Guide, Mark, Panel, joint_label, length_unit
 from dvrk_drake.reports.reproduction.page import ResultTable, Section, numbers, share
 
 #: Interval over which a drift rate is averaged [s].
@@ -174,9 +168,8 @@ def reproduce_figure_5(session: ReproductionSession) -> Section:
     frictionless_ours = release_without_friction(mtm.file, few, "ours")
     damped = release_without_friction(mtm.file, poses, "ours damped", damped=True)
     without_friction = {"the paper's": frictionless_paper, "ours": frictionless_ours, "ours with damping": damped}
-    figures = _plots(
-        session.folder, "fig5", "all torques on", ours, paper, published.FIGURE_5, published.FIGURE_5_MEANS
-    )
+    what = "all torques on"
+    plots = _plots("fig5", what, ours, paper, published.FIGURE_5, published.FIGURE_5_MEANS)
     tables = (
         drift_table(
             "fig5",
@@ -223,7 +216,7 @@ def reproduce_figure_5(session: ReproductionSession) -> Section:
         "the torque error divided by the damping. The arm does not accelerate.",
     )
     title = "Fig. 5: drift after release, all torques"
-    return Section("fig5", title, _finding(ours, paper), remarks, tables, figures)
+    return Section("fig5", title, _finding(ours, paper), remarks, tables, plots)
 
 
 def reproduce_figure_6(session: ReproductionSession) -> Section:
@@ -233,9 +226,8 @@ def reproduce_figure_6(session: ReproductionSession) -> Section:
     zeroed = session.without_wrist_torque(session.paper_file)
     paper = session.release(PAPER_ARM, mtm.truth, zeroed, few, "Fig. 6: releasing the paper's")
     ours = session.release(PAPER_ARM, mtm.truth, session.without_wrist_torque(mtm.file), few, "Fig. 6: releasing ours")
-    figures = _plots(
-        session.folder, "fig6", "zero torque on joints 5-7", ours, paper, published.FIGURE_6, published.FIGURE_6_MEANS
-    )
+    what = "zero torque on joints 5-7"
+    plots = _plots("fig6", what, ours, paper, published.FIGURE_6, published.FIGURE_6_MEANS)
     table = drift_table("fig6", "zero torque on joints 5-7", published.FIGURE_6, published.FIGURE_6_MEANS, paper, ours)
     remarks = (
         f"The experiment uses the arm and the first {len(few)} poses of Fig. 5. Joints 5-7 have zero torque, so only "
@@ -248,7 +240,7 @@ def reproduce_figure_6(session: ReproductionSession) -> Section:
         "ground-truth arm.",
     )
     title = "Fig. 6: drift after release, zero torque on joints 5-7"
-    return Section("fig6", title, _finding(ours, paper), remarks, (table,), figures)
+    return Section("fig6", title, _finding(ours, paper), remarks, (table,), plots)
 
 
 def _finding(ours: Drifts, paper: Drifts) -> str:
@@ -299,25 +291,16 @@ def _per_joint(drifts: Drifts) -> str:
 
 
 def _plots(
-    folder: Path,
-    name: str,
-    what: str,
-    ours: Drifts,
-    paper: Drifts,
-    trial: Sequence[float],
-    means: Sequence[float],
-) -> dict[str, str]:
-    """Writes <name>_time.png and <name>_distribution.png, and returns the captions by file name."""
+    name: str, what: str, ours: Drifts, paper: Drifts, trial: Sequence[float], means: Sequence[float]
+) -> tuple[Plot, Plot]:
+    """Returns the drift of one release over time, and the distribution of the largest drift of each release."""
     wrist = np.abs(paper.final[:, 4:]).max(axis=1)
     typical = int(np.argsort(wrist)[len(wrist) // 2])
-    _plot_time(folder / f"{name}_time.png", what, ours, paper, typical, trial)
     releases = {"the paper's parameters": (REFERENCE, paper), "ours": (FITTED, ours)}
-    plot_largest_drifts(folder / f"{name}_distribution.png", what, releases, means)
-    return {
-        f"{name}_time.png": f"Drift after release, {what}, at the pose with the median wrist drift of the paper's "
-        "parameters",
-        f"{name}_distribution.png": f"Cumulative distribution of the largest drift of each release, {what}",
-    }
+    return (
+        _time_plot(f"{name}_time", what, ours, paper, typical, trial),
+        largest_drifts_plot(f"{name}_distribution", what, releases, means),
+    )
 
 
 def _band_label(arm: Arm) -> str:
@@ -325,61 +308,53 @@ def _band_label(arm: Arm) -> str:
     return f"limit for a held joint: {1e3 * BAND[0]:.0f} mrad{length}"
 
 
-def _plot_time(path: Path, what: str, ours: Drifts, paper: Drifts, release: int, trial: Sequence[float]) -> None:
-    arm = ours.arm
-    figure, panels = panel_grid(arm.num_joints, sharex=True)
+def _time_plot(name: str, what: str, ours: Drifts, paper: Drifts, release: int, trial: Sequence[float]) -> Plot:
+    arm, panels = ours.arm, []
     t = SAMPLE_PERIOD * np.arange(ours.positions.shape[1])
-    for j, ax in enumerate(panels):
+    for j in range(arm.num_joints):
+        marks: list[Mark] = []
         for drifts, colour, label in ((paper, REFERENCE, "the paper's parameters"), (ours, FITTED, "ours")):
             q = drifts.positions[release, :, j]
-            ax.plot(t, q - q[0], color=colour, label=f"{label}, simulated")
-        for sign in (-1, 1):
-            ax.axhline(sign * BAND[0], color=LIMIT, linestyle="--", linewidth=1.0, label=_band_label(arm))
+            marks.append(Curve(f"{label}, simulated", t, q - q[0], colour))
+        marks += [Guide("y", sign * BAND[0], None, LIMIT, _band_label(arm)) for sign in (-1, 1)]
         if j:
-            ax.axhline(trial[j - 1], color=MEASURED, linestyle=":", label="published (measured), end of the trial")
-        ax.set_title(joint_title(arm, j))
-        ax.set_ylabel("drift [rad]")
-        ax.set_xlabel("time since release [s]")
-    set_title(figure, f"Drift after release, {what}: a held joint stays between the dashed lines")
-    add_legend(figure)
-    save_figure(figure, path)
+            marks.append(Guide("y", trial[j - 1], None, MEASURED, "published (measured), end of the trial"))
+        panels.append(Panel(joint_label(arm, j), marks, "time since release [s]", "drift [rad]"))
+    caption = f"Drift after release, {what}, at the pose with the median wrist drift of the paper's parameters"
+    return Plot(name, caption, panels, columns=2)
 
 
-def plot_largest_drifts(
-    path: Path,
+def largest_drifts_plot(
+    name: str,
     what: str,
     releases: Mapping[str, tuple[str, Drifts]],
     published_means: Sequence[float] | None = None,
-) -> None:
-    """Plots the cumulative distribution of the largest drift of each release, with the same range for all joints.
+) -> Plot:
+    """Returns the cumulative distribution of the largest drift of each release, with the same range for all joints.
 
     Args:
-        path: PNG file to write.
-        what: Condition of the experiment, for the title.
+        name: Name of the plot.
+        what: Condition of the experiment, for the caption.
         releases: Mapping from the name of a model to its colour and its drifts.
         published_means: Published mean drifts (n - 1,) of all joints but the first [rad].
     """
     first = next(iter(releases.values()))[1]
-    arm, band = first.arm, first.arm.per_joint(*BAND)
+    arm, band, panels = first.arm, first.arm.per_joint(*BAND), []
     largest = max(float(drifts.largest.max()) for _, drifts in releases.values())
-    figure, panels = panel_grid(arm.num_joints, sharex="all", sharey="all")
-    for j, ax in enumerate(panels):
+    limits = (0.8 * SMALLEST_DRIFT, 1.5 * max(largest, 10 * SMALLEST_DRIFT))
+    for j in range(arm.num_joints):
+        marks: list[Mark] = []
         for label, (colour, drifts) in releases.items():
             sizes = np.sort(np.maximum(drifts.largest[:, j], SMALLEST_DRIFT))
             shares = 100 * np.arange(len(sizes) + 1) / len(sizes)
-            ax.step(np.append(sizes[0], sizes), shares, where="post", color=colour, label=label)
-        ax.axvline(band[j], color=LIMIT, linestyle="--", label=_band_label(arm))
+            marks.append(Curve(label, np.append(sizes[0], sizes), shares, colour, "step"))
+        marks.append(Guide("x", float(band[j]), None, LIMIT, _band_label(arm)))
         if published_means is not None and j:
-            ax.axvline(published_means[j - 1], color=MEASURED, linestyle=":", label="published, mean of five trials")
-        ax.set_xscale("log")
-        ax.set_title(joint_title(arm, j))
-        ax.set_xlabel(f"largest drift [{position_unit(arm, j)}]")
-        ax.set_ylabel("cumulative share [%]")
-    panels[0].set_xlim(0.8 * SMALLEST_DRIFT, 1.5 * max(largest, 10 * SMALLEST_DRIFT))
+            marks.append(Guide("x", published_means[j - 1], None, MEASURED, "published, mean of five trials"))
+        labels = f"largest drift [{length_unit(arm, j)}]", "cumulative share [%]"
+        panels.append(Panel(joint_label(arm, j), marks, *labels, x_range=limits, log_x=True))
     counts = ", ".join(f"{len(drifts.positions)} poses with {label}" for label, (_, drifts) in releases.items())
-    set_title(
-        figure,
-        f"Largest drift of each release, {what}: {counts}\nThe share at the dashed line is the share of held joints",
+    caption = (
+        f"Largest drift of each release, {what}: {counts}. The share at the dashed line is the share of held joints"
     )
-    add_legend(figure)
-    save_figure(figure, path)
+    return Plot(name, caption, panels, columns=2)

@@ -18,7 +18,7 @@ from dvrk_drake.experiments.reproduction.session import ReproductionSession
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import base_body, make_arm_plant
 from dvrk_drake.reports.colours import FITTED, REFERENCE
-from dvrk_drake.reports.reproduction.drift import plot_largest_drifts
+from dvrk_drake.reports.reproduction.drift import largest_drifts_plot
 from dvrk_drake.reports.reproduction.page import ResultTable, Section, numbers, share
 
 
@@ -72,9 +72,6 @@ def reproduce_table_1() -> Section:
     )
 
 
-_FILE = "psm_release.png"
-
-
 def reproduce_psm(session: ReproductionSession) -> Section:
     """Compares the paper's model of the PSM with ours, and simulates releases of a PSM."""
     psm, sample_sizes = session.psm, session.sample_sizes
@@ -85,7 +82,6 @@ def reproduce_psm(session: ReproductionSession) -> Section:
     psm_nominal.save(nominal_file)
     nominal = session.release("psm", psm.truth, nominal_file, poses, "PSM: releasing the nominal model")
     releases = {"the nominal model": (REFERENCE, nominal), "ours": (FITTED, ours)}
-    plot_largest_drifts(session.folder / _FILE, "PSM", releases)
     names = ours.arm.joint_names
     disabled = [joint.name for joint in psm.model.joints if joint.feedforward_scale == 0.0]
     rows = (
@@ -109,13 +105,13 @@ def reproduce_psm(session: ReproductionSession) -> Section:
         "roll joint is larger than its friction.",
     )
     release = ResultTable("psm_release", "Absolute drift after release [rad; insertion m]", ("", *names), rows)
-    shows = "PSM: cumulative distribution of the largest drift of each release"
     finding = (
         f"With our model, all joints of the PSM stay within {1e3 * BAND[0]:.0f} mrad ({1e3 * BAND[1]:.1f} mm) at "
         f"{share(ours.num_held, len(poses))} of the poses, with the nominal model at "
         f"{share(nominal.num_held, len(poses))}."
     )
-    return Section("psm", "Fig. 8: the PSM", finding, remarks, (_facts(), release), {_FILE: shows})
+    plot = largest_drifts_plot("psm_release", "PSM", releases)
+    return Section("psm", "Fig. 8: the PSM", finding, remarks, (_facts(), release), (plot,))
 
 
 def _facts() -> ResultTable:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +13,10 @@ from numpy.typing import ArrayLike
 
 from dvrk_drake.experiments.study.table import Share
 from dvrk_drake.models.files import atomic_write
-from dvrk_drake.reports.html import page as html_page
-from dvrk_drake.reports.html.page import Block, Command, Image, Page, Plot, Table, Text
+from dvrk_drake.reports import page as blocks
+from dvrk_drake.reports.html_file import write_html
+from dvrk_drake.reports.image_files import write_images
+from dvrk_drake.reports.page import Page, Plot, Table, Text
 from dvrk_drake.reports.provenance import Provenance
 
 
@@ -56,8 +58,7 @@ class Section:
         finding: Result in one sentence.
         remarks: Paragraphs about the experiment and the differences from the paper.
         tables: Tables of results.
-        figures: Mapping from the PNG file in the folder of the page to its caption.
-        plots: Interactive plots.
+        plots: Plots.
     """
 
     name: str
@@ -65,21 +66,20 @@ class Section:
     finding: str
     remarks: tuple[str, ...]
     tables: tuple[ResultTable, ...] = ()
-    figures: dict[str, str] = field(default_factory=dict)
     plots: tuple[Plot, ...] = ()
 
-    def html(self, folder: Path) -> html_page.Section:
-        """Returns the section of the page. The figures are in `folder`."""
-        blocks: list[Block] = [Text(self.finding, "result"), *(table.block for table in self.tables)]
-        blocks += [Image((folder / figure).read_bytes(), caption) for figure, caption in self.figures.items()]
-        return html_page.Section(self.title, [*blocks, *self.plots, *map(Text, self.remarks)])
+    @property
+    def blocks(self) -> blocks.Section:
+        """The section of the page."""
+        tables = (table.block for table in self.tables)
+        return blocks.Section(self.title, [Text(self.finding), *tables, *self.plots, *map(Text, self.remarks)])
 
 
 def write_page(folder: Path, sections: Sequence[Section], left_out: Sequence[str], origin: Provenance) -> Path:
-    """Writes index.html and a CSV file for each table.
+    """Writes index.html, a CSV file for each table and a PNG file for each plot.
 
     Args:
-        folder: Existing folder that contains the figures.
+        folder: Existing folder.
         sections: Sections of the page, in order.
         left_out: Requested results that could not be computed, with the reason for each.
         origin: Provenance of the page.
@@ -96,15 +96,12 @@ def write_page(folder: Path, sections: Sequence[Section], left_out: Sequence[str
     page = Page(
         "Reproduction of the paper",
         f"{len(sections)} of {len(sections) + len(left_out)} requested results were computed.",
-        [
-            html_page.Section("Findings", [*missing, findings], _PREFACE),
-            *(section.html(folder) for section in sections),
-            html_page.Section("Next step", [_NEXT_DATA if left_out else _NEXT_STUDY]),
-        ],
-        origin,
+        [blocks.Section("Findings", [*missing, findings], _PREFACE), *(section.blocks for section in sections)],
         "warning" if left_out else "good",
+        *(_NEXT_DATA if left_out else _NEXT_STUDY),
     )
-    page.write(folder / "index.html")
+    write_images(page, folder)
+    write_html(page, folder / "index.html", origin)
     return folder / "index.html"
 
 
@@ -126,11 +123,11 @@ _PREFACE = (
     "N m. "
     '"The paper\'s" denotes the method or parameters of the paper, "ours" denotes the method or model of this project.'
 )
-_NEXT_DATA = Command(
+_NEXT_DATA = (
     "dvrk-drake reproduce all --folder reproduction --data FOLDER",
     "Computes all results. FOLDER contains the recording of the paper (docs/reproduction.md).",
 )
-_NEXT_STUDY = Command(
+_NEXT_STUDY = (
     "dvrk-drake simulate study examples/release_study.yaml --output release.csv --report release.html",
     "Repeats releases with your own poses, seeds and variations.",
 )

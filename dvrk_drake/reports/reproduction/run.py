@@ -20,9 +20,7 @@ from dvrk_drake.workers import local_executor
 
 _MAKERS: dict[str, Callable[[ReproductionSession], Section]] = {
     "table1": lambda session: reproduce_table_1(),
-    "fig4": lambda session: reproduce_figure_4(
-        session.recordings, session.folder, step_progress(session.progress, "identifying")
-    ),
+    "fig4": lambda session: reproduce_figure_4(session.recordings, step_progress(session.progress, "identifying")),
     "fig5": reproduce_figure_5,
     "fig6": reproduce_figure_6,
     "fig7": reproduce_figure_7,

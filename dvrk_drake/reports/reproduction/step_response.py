@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,15 +21,15 @@ from dvrk_drake.experiments.reproduction.step_response import (
 )
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.reports.colours import COMMANDED, SERIES
-from dvrk_drake.reports.figures.style import add_legend, panel_grid, save_figure, set_title
+from dvrk_drake.reports.page import Plot
+from dvrk_drake.reports.plot import Curve, Guide, Mark, Panel
 from dvrk_drake.reports.reproduction.page import ResultTable, Section, numbers
 
-_FILE = "fig7.png"
 _JOINTS = tuple(f"J{j}" for j in range(1, 8))
 
 
 def reproduce_figure_7(session: ReproductionSession, duration: float = DURATION) -> Section:
-    """Simulates the paper's controller on the paper's arm and ours on the ground-truth arm, and writes fig7.png."""
+    """Simulates the paper's controller on the paper's arm and ours on the ground-truth arm."""
     folder, mtm = session.folder, session.mtm
 
     def progress(share: float) -> None:
@@ -42,7 +40,6 @@ def reproduce_figure_7(session: ReproductionSession, duration: float = DURATION)
     damped = simulate_paper_controller(theirs_arm, duration, False, lambda share: progress(0.4 + 0.4 * share))
     ours = simulate_ours(mtm.truth.arm, mtm.model, min(duration, OUR_DURATION))
     progress(1.0)
-    _plot(folder / _FILE, faulty, ours)
     rows = (
         (
             "published (read from the figure)",
@@ -86,15 +83,11 @@ def reproduce_figure_7(session: ReproductionSession, duration: float = DURATION)
         ("", *_JOINTS),
         rows,
     )
-    shows = (
-        "Step to zero: ours on the ground-truth arm (top), the paper's controller on the paper's arm (bottom); "
-        "right: enlarged"
-    )
     finding = (
         f"In the last 10 s, joint 7 moves up to {_late(faulty)[6]:.3f} rad with the paper's controller as published, "
         f"and up to {_late(damped)[6]:.0e} rad after its programming fault is corrected."
     )
-    return Section("fig7", "Fig. 7: step to zero", finding, remarks, (table,), {_FILE: shows})
+    return Section("fig7", "Fig. 7: step to zero", finding, remarks, (table,), (_plot(faulty, ours),))
 
 
 def _late(q: NDArray[np.float64], from_time: float | None = None) -> NDArray[np.float64]:
@@ -102,24 +95,19 @@ def _late(q: NDArray[np.float64], from_time: float | None = None) -> NDArray[np.
     return np.abs(q[max(first, 0) :]).max(axis=0)
 
 
-def _plot(path: Path, faulty: NDArray[np.float64], ours: NDArray[np.float64]) -> None:
-    figure, panels = panel_grid(4, columns=2, height=3.4)
-    names = load_arm(PAPER_ARM).joint_names
+def _plot(faulty: NDArray[np.float64], ours: NDArray[np.float64]) -> Plot:
+    """Returns the positions of all joints in the step to zero, beside them enlarged."""
+    names, panels = load_arm(PAPER_ARM).joint_names, []
     runs = ((ours, "ours on the ground-truth arm"), (faulty, "the paper's controller on the paper's arm"))
-    for row, (q, label) in enumerate(runs):
+    for q, label in runs:
         t = PERIOD * np.arange(len(q))
-        for column, ax in enumerate(panels[2 * row : 2 * row + 2]):
-            for j, (joint, name) in enumerate(zip(_JOINTS, names, strict=True)):
-                ax.plot(t, q[:, j], color=SERIES[j], linestyle=("-", "--")[j % 2], label=f"{joint} {name}")
-            ax.axhline(0.0, color=COMMANDED, linestyle=":", label="target")
-            ax.set_title(f"{label}, {t[-1]:.0f} s{', enlarged' if column else ''}")
-            ax.set_xlabel("time [s]")
-            ax.set_ylabel("position [rad]")
-            if column:
-                ax.set_ylim(-0.1, 0.1)
-    set_title(
-        figure,
-        "Fig. 7 reproduced: joint positions in the step to zero. The oscillation of the paper's controller persists",
-    )
-    add_legend(figure)
-    save_figure(figure, path)
+        marks: list[Mark] = [
+            Curve(f"{joint} {name}", t[::5], q[::5, j], SERIES[j], "dashed" if j % 2 else "line")
+            for j, (joint, name) in enumerate(zip(_JOINTS, names, strict=True))
+        ]
+        marks.append(Guide("y", 0.0, None, COMMANDED, "target"))
+        title, labels = f"{label}, {t[-1]:.0f} s", ("time [s]", "position [rad]")
+        panels.append(Panel(title, marks, *labels, height=260))
+        panels.append(Panel(f"{title}, enlarged", marks, *labels, y_range=(-0.1, 0.1), height=260))
+    caption = "Fig. 7 reproduced: joint positions in the step to zero"
+    return Plot("fig7", caption, panels, columns=2)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,19 +11,19 @@ from dvrk_drake.analysis.static.static_identification import StaticIdentificatio
 from dvrk_drake.experiments.reproduction.published import FIGURE_4_MEANS, PAPER_ARM, PaperRecordings
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.reports.colours import HELD_OUT, LIMIT, MEASURED, REFERENCE
-from dvrk_drake.reports.figures.style import add_legend, joint_title, panel_grid, save_figure, set_title
+from dvrk_drake.reports.page import Plot
+from dvrk_drake.reports.plot import Curve, Mark, Panel, Style, joint_label
 from dvrk_drake.reports.reproduction.page import ResultTable, Section, numbers
 
-_FILE = "fig4.png"
 #: Smallest drawn squared error [(N m)^2]. Smaller squared errors are drawn at this value. They occur if an effort was
 #: measured as exactly 0.
 FLOOR = 1e-9
 
 
 def reproduce_figure_4(
-    recordings: PaperRecordings, folder: Path, progress: Callable[[float], object] = lambda share: None
+    recordings: PaperRecordings, progress: Callable[[float], object] = lambda share: None
 ) -> Section:
-    """Computes the squared torque errors of joints 2-7 at the 72 poses of the paper, and writes fig4.png.
+    """Computes the squared torque errors of joints 2-7 at the 72 poses of the paper.
 
     Raises:
         RecordingError: The recording is missing.
@@ -35,7 +34,6 @@ def reproduce_figure_4(
     published = recordings.figure_4
     zero = recording.measured_effort()
     included = ~_excluded(ours)
-    _plot(folder / _FILE, ours, paper, zero, included)
     same = (
         "The reproduced squared errors differ from the published squared errors by at most "
         f"{np.abs(paper.residuals[:, 1:] ** 2 - published).max():.0e} (N m)^2. "
@@ -90,7 +88,6 @@ def reproduce_figure_4(
         "has a smaller error on J2 than ours, because the paper's method fits the torque of the joint stop together "
         "with gravity.",
     )
-    shows = "Squared torque error of joints 2-7 at 72 poses, leave-one-out; errors below 1e-9 are drawn at 1e-9"
     better = sum(
         np.mean(ours.leave_one_out_residuals[included[:, j], j] ** 2)
         < np.mean(paper.leave_one_out_residuals[included[:, j], j] ** 2)
@@ -99,7 +96,8 @@ def reproduce_figure_4(
     finding = (
         f"In cross-validation, our identification has a smaller torque error than the paper's on {better} of 6 joints."
     )
-    return Section("fig4", "Fig. 4: torque errors", finding, remarks, (squared, left_out), {_FILE: shows})
+    plot = _plot(ours, paper, zero, included)
+    return Section("fig4", "Fig. 4: torque errors", finding, remarks, (squared, left_out), (plot,))
 
 
 def _excluded(ours: StaticIdentification) -> NDArray[np.bool_]:
@@ -110,34 +108,27 @@ def _excluded(ours: StaticIdentification) -> NDArray[np.bool_]:
 
 
 def _plot(
-    path: Path,
-    ours: StaticIdentification,
-    paper: StaticIdentification,
-    zero: NDArray[np.float64],
-    included: NDArray[np.bool_],
-) -> None:
-    arm = ours.model.arm
-    figure, panels = panel_grid(6, columns=3, height=3.0)
+    ours: StaticIdentification, paper: StaticIdentification, zero: NDArray[np.float64], included: NDArray[np.bool_]
+) -> Plot:
+    """Returns the squared torque errors of joints 2-7 at each pose."""
+    arm, panels = ours.model.arm, []
     pose = np.arange(1, len(zero) + 1)
-    for j, ax in enumerate(panels, start=1):
-        for values, label, colour, marker in (
-            (zero, "zero torque", MEASURED, "_"),
-            (paper.leave_one_out_residuals, "the paper's least squares, leave-one-out", REFERENCE, "s"),
-            (ours.leave_one_out_residuals, "ours, leave-one-out", HELD_OUT, "o"),
-        ):
-            squared = np.maximum(values[:, j] ** 2, FLOOR)
-            use = included[:, j]
-            ax.semilogy(pose[use], squared[use], marker, color=colour, markersize=3.5, label=label)
-            ax.semilogy(pose[~use], squared[~use], "x", color=colour, markersize=5)
-        ax.set_ylim(bottom=FLOOR / 2)
-        ax.set_title(joint_title(arm, j))
-        ax.set_ylabel("squared error [(N m)$^2$]")
-        ax.set_xlabel("pose")
-    panels[0].plot([], [], "x", color=LIMIT, label="excluded measurement (in the colour of its series)")
-    set_title(
-        figure,
-        f"Fig. 4 reproduced: squared torque error at {len(zero)} poses of the paper. Each pose was not used to fit "
-        "(leave-one-out)",
+    cases: tuple[tuple[str, NDArray[np.float64], str, Style], ...] = (
+        ("zero torque", zero, MEASURED, "dots"),
+        ("the paper's least squares, leave-one-out", paper.leave_one_out_residuals, REFERENCE, "diamonds"),
+        ("ours, leave-one-out", ours.leave_one_out_residuals, HELD_OUT, "circles"),
     )
-    add_legend(figure)
-    save_figure(figure, path)
+    for j in range(1, 7):
+        marks: list[Mark] = []
+        use = included[:, j]
+        for name, values, colour, style in cases:
+            squared = np.maximum(values[:, j] ** 2, FLOOR)
+            marks.append(Curve(name, pose[use], squared[use], colour, style))
+            marks.append(Curve("excluded measurement", pose[~use], squared[~use], LIMIT, "crosses"))
+        labels = "pose [1]", "squared error [(N m)²]"
+        panels.append(Panel(joint_label(arm, j), marks, *labels, log_y=True, height=230))
+    caption = (
+        f"Fig. 4 reproduced: squared torque error at {len(zero)} poses of the paper. Each pose was not used to fit "
+        f"(leave-one-out). Errors below {FLOOR:g} are drawn at {FLOOR:g}"
+    )
+    return Plot("fig4", caption, panels, columns=2)

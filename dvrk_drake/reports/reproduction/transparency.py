@@ -7,8 +7,6 @@ from pathlib import Path
 from dvrk_drake.dynamics.friction_compensation import MAX_RATIO
 from dvrk_drake.experiments.reproduction.session import OperatorCase, ReproductionSession, simulate_case
 from dvrk_drake.experiments.transparency import OperatorForces
-from dvrk_drake.reports.html.page import Plot
-from dvrk_drake.reports.plotly_figures import plotly_figure
 from dvrk_drake.reports.reproduction.page import ResultTable, Section
 from dvrk_drake.reports.transparency import forces_plot
 
@@ -48,7 +46,7 @@ def reproduce_transparency(session: ReproductionSession) -> Section:
         f"the paper's, {forces[2].rms_force:.2f} N with ours, {forces[3].rms_force:.2f} N with friction compensation.",
         remarks,
         (table,),
-        plots=(Plot(plotly_figure(forces_plot(forces)), forces_plot(forces).caption),),
+        plots=(forces_plot(forces),),
     )
 
 

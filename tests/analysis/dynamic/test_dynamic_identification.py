@@ -3,13 +3,13 @@
 import copy
 import dataclasses
 from collections import Counter
-from io import StringIO
 
 import numpy as np
 import pytest
 from command_output import refusal
 from motions import fourier_motion, friction_everywhere, recorded, true_dynamics
 from recordings import csv_block
+from report_pages import printed
 
 from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic, motion_problem
 from dvrk_drake.analysis.dynamic.validation import predict_motion, validate_motion
@@ -28,8 +28,8 @@ from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.models.linear_map import LinearMap
 from dvrk_drake.recordings.recording import Recording, file_transmission
 from dvrk_drake.recordings.writing import write_recording
-from dvrk_drake.reports.identification import print_identification
-from dvrk_drake.reports.terminal_tables import TABLE_WIDTH, TableConsole
+from dvrk_drake.reports.identification import identification_page
+from dvrk_drake.reports.terminal import TABLE_WIDTH
 
 pytestmark = pytest.mark.numeric
 
@@ -136,9 +136,7 @@ def test_base_parameters_of_the_motion_lie_in_their_intervals(case):
 
 def test_every_parameter_is_printed_on_request(case):
     _, _, _, result = case
-    console = TableConsole(file=StringIO(), highlight=False, width=TABLE_WIDTH)
-    print_identification(console, result, verbose=True)
-    text = console.file.getvalue()
+    text = printed(identification_page(result), verbose=True)
     assert max(map(len, text.splitlines())) <= TABLE_WIDTH
     section = result.model.dynamics
     folded = "".join(text.split())

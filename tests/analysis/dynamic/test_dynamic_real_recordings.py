@@ -92,7 +92,7 @@ def test_commands_accept_a_real_motion(case, tmp_path):
     name, arm, recording, _, folder = case
     path, model = folder / "motion.csv", folder / "model.yaml"
     errors, tau = tmp_path / "errors.json", tmp_path / "tau.csv"
-    assert {p.name for p in (folder / "plots").iterdir()} == {"efforts.png", "residuals.png", "error_budget.png"}
+    assert {p.name for p in (folder / "plots").iterdir()} >= {"efforts.png", "residuals.png", "error_budget.png"}
     assert main(["validate", str(path), "--model", str(model), "--json", str(errors)]) == 0
     found = json.loads(errors.read_text())
     assert found["coordinates"] == "actuator" and found["mean_relative_error"] < TARGET[name] / 100

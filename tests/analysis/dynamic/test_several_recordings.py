@@ -145,8 +145,8 @@ def test_command_prints_the_error_of_each_recording(days, tmp_path, capsys, monk
     assert "2 recordings, 6000 rows" in text and "predicted by a model of the others" in text
     assert "a.csv" in text and "b.csv" in text
     page = (tmp_path / "report.html").read_text()
-    assert page.count("Residuals over position and speed") >= 2 and "held-out efforts: b.csv" in page
-    assert (tmp_path / "plots/efforts.png").exists() and (tmp_path / "plots/2/efforts.png").exists()
+    assert "Residuals: a.csv" in page and "Measured and predicted efforts: b.csv" in page
+    assert (tmp_path / "plots/efforts.png").exists() and (tmp_path / "plots/efforts_2.png").exists()
     assert main(["validate", "b.csv", "--model", "model.yaml", "--save"]) == 2
     assert "identified from this recording" in refusal(capsys.readouterr().err)
     assert main(["identify", "a.csv", "a.csv", "--arm", "psm", "--output", "twice.yaml"]) == 2

@@ -1,1 +1,0 @@
-"""Plots results as PNG files. Only `dvrk_drake.reports` imports Matplotlib."""

@@ -1,1 +1,0 @@
-"""HTML reports: the page builder, and one module per kind of result."""
