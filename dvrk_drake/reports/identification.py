@@ -30,7 +30,6 @@ from dvrk_drake.reports.efforts import (
 )
 from dvrk_drake.reports.page import Block, Level, Page, Scene, Section, Table, Text, Verdict
 from dvrk_drake.reports.parameters import parameter_blocks
-from dvrk_drake.reports.playback import playback
 from dvrk_drake.reports.plot import length_unit
 
 #: Level of each verdict. "off" and "not judged" have no colour.
@@ -343,18 +342,24 @@ def _effort_sections(efforts: Efforts, name: str, suffix: str) -> list[Section]:
 
 def _view(efforts: Efforts) -> Scene:
     arm = efforts.arm
+
+    def play(t: NDArray[np.float64], q: NDArray[np.float64], tau: NDArray[np.float64]) -> str:
+        from dvrk_drake.reports.playback import playback  # slow to import, and a terminal does not need it
+
+        return playback(arm, t, q, tau)
+
     if (grid := efforts.grid) is not None:
         tau = efforts.recording.in_joint_coordinates(arm).measured_effort()
 
         def html() -> str:
             on_grid = np.column_stack([np.interp(grid.t, grid.row_times, x) for x in tau.T])
-            return playback(arm, grid.t - grid.row_times[0], grid.q, on_grid)
+            return play(grid.t - grid.row_times[0], grid.q, on_grid)
 
         start = float(grid.t[0] - grid.row_times[0])
         return Scene(html, "Recorded motion. Click a plot to move the arm to this time.", start)
     poses = efforts.recording.in_joint_coordinates(arm)
     caption = "Recorded poses, one per second. Click a plot to show a pose."
-    return Scene(lambda: playback(arm, efforts.x, poses.q, poses.measured_effort()), caption, 1.0)
+    return Scene(lambda: play(efforts.x, poses.q, poses.measured_effort()), caption, 1.0)
 
 
 def _data_quality(result: Result, efforts: Efforts) -> list[Block]:

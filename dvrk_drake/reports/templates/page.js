@@ -65,12 +65,12 @@
     plot.cursors = plot.cursors || [];
     while (plot.cursors.length < axes.length) plot.cursors.push(addCursor(plot, plot.cursors.length));
     axes.forEach((axis, i) => {
-      const x = toPixel(axis, time);
-      // Axes of one column of panels share one line.
-      const repeated = axes.slice(0, i).some((other) => Math.abs(other._offset - axis._offset) < 1);
+      // Each panel has its own line, so that no line crosses a title.
+      const x = toPixel(axis, time), y = axis._mainSubplot ? plot._fullLayout._plots[axis._mainSubplot].yaxis : null;
       const inside = x >= axis._offset - 1 && x <= axis._offset + axis._length + 1;
       Object.assign(plot.cursors[i].style, {
-        display: inside && !repeated ? "block" : "none", left: x + "px", top: size.t + "px", height: size.h + "px",
+        display: inside ? "block" : "none", left: x + "px",
+        top: (y ? y._offset : size.t) + "px", height: (y ? y._length : size.h) + "px",
       });
     });
   }
