@@ -16,7 +16,7 @@ from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effect_kinds import EFFECT_KINDS, POSITION_KINDS
 from dvrk_drake.models.effects_schema import half_width
-from dvrk_drake.models.schema_fault import number_fault
+from dvrk_drake.models.ranges import number_fault
 
 
 def effect_shapes(

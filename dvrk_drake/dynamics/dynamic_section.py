@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 from dvrk_drake.models.arm_schema import GRAVITIES
 from dvrk_drake.models.effects_schema import FREEDOMS, DriveEffect
-from dvrk_drake.models.schema_fault import within
+from dvrk_drake.models.ranges import within
 
 #: Allowed ranges of estimates, standard errors and efforts. They detect wrong units and misplaced decimal points (see
 #: docs/number_ranges.md), and are wide because parameters that a recording does not identify can have any value.

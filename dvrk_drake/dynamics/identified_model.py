@@ -36,7 +36,7 @@ from dvrk_drake.models.effects_schema import FREEDOMS, DriveEffect, half_width
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.locked_joints import lock_joints
 from dvrk_drake.models.model_file import MODEL_SUFFIXES
-from dvrk_drake.models.schema_fault import number_fault, within
+from dvrk_drake.models.ranges import number_fault, within
 from dvrk_drake.models.sdf_model import PACKAGE_URL
 from dvrk_drake.models.typed_yaml import load_yaml, typed_content
 

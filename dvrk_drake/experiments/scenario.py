@@ -21,7 +21,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import known_arms
 from dvrk_drake.models.arm_schema import Gains, load_gains
 from dvrk_drake.models.model_file import MODEL_SUFFIXES
-from dvrk_drake.models.schema_fault import within
+from dvrk_drake.models.ranges import within
 from dvrk_drake.models.typed_yaml import load_yaml, parse_yaml, typed_content
 from dvrk_drake.systems.gravity_pid_controller import Mode
 from dvrk_drake.systems.hand import Grip

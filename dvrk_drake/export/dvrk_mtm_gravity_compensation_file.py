@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm_files import known_arms
 from dvrk_drake.models.files import atomic_write, read_json_input
-from dvrk_drake.models.schema_fault import number_fault, within
+from dvrk_drake.models.ranges import number_fault, within
 
 #: Version of the files that `GravityCompensationFile.save` writes.
 VERSION = "2.0"

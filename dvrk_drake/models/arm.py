@@ -28,7 +28,7 @@ from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 from dvrk_drake.models.effects_schema import ArmEffects, per_actuator
 from dvrk_drake.models.immutable import cached, immutable
 from dvrk_drake.models.linear_map import LinearMap
-from dvrk_drake.models.schema_fault import RANGE, Range, number_fault
+from dvrk_drake.models.ranges import RANGE, Range, number_fault
 
 #: Maximum norm of the gravity vector [m/s^2].
 MAX_GRAVITY = 30.0

@@ -30,7 +30,7 @@ from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.models.immutable import cached
 from dvrk_drake.models.linear_map import LinearMap
 from dvrk_drake.models.model_file import MODEL_SUFFIXES
-from dvrk_drake.models.schema_fault import suggest_name
+from dvrk_drake.models.ranges import suggest_name
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL, SdfFacts, compose_sdf, local_path, read_sdf_facts
 from dvrk_drake.models.typed_yaml import load_typed_yaml
 

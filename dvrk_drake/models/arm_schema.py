@@ -10,7 +10,7 @@ from dvrk_drake.errors import ControllerError
 from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.immutable import Shared
-from dvrk_drake.models.schema_fault import RANGE, Range, within
+from dvrk_drake.models.ranges import RANGE, Range, within
 from dvrk_drake.models.typed_yaml import load_typed_yaml
 
 #: Accepted position limits of a joint. Two turns in each direction suffice for a joint with stops: the roll joint of an

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.models.arm_schema import ANGLE_WIDTHS, ANGLES, TRAVEL_WIDTHS, TRAVELS, CoupledLimit
-from dvrk_drake.models.schema_fault import number_fault
+from dvrk_drake.models.ranges import number_fault
 
 
 def coupled_limit_fault(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.effect_kinds import POSITION_KINDS, kind_fault
 from dvrk_drake.models.immutable import Shared
-from dvrk_drake.models.schema_fault import number_fault, within
+from dvrk_drake.models.ranges import number_fault, within
 
 #: Accepted quantization steps and noise of efforts. One bit of a dVRK wrist motor is 1e-5 N m.
 _EFFORT_STEPS = within(1e-9, 100.0, "N m or N")

@@ -16,7 +16,7 @@ from pydrake.systems.framework import DiagramBuilder
 from dvrk_drake.errors import DvrkDrakeError, ExcitationError
 from dvrk_drake.models.files import read_text_input
 from dvrk_drake.models.plant import package_map
-from dvrk_drake.models.schema_fault import number_fault, within
+from dvrk_drake.models.ranges import number_fault, within
 from dvrk_drake.models.typed_yaml import parse_yaml
 
 #: Accepted directives. `add_directives` would read a second file, which a motion file does not contain.

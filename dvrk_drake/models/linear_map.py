@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dvrk_drake.models.immutable import immutable
-from dvrk_drake.models.schema_fault import within
+from dvrk_drake.models.ranges import within
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ from dvrk_drake.models.arm_schema import CoupledLimit, Gains
 from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.models.immutable import cached
 from dvrk_drake.models.linear_map import LinearMap
-from dvrk_drake.models.schema_fault import suggest_name
+from dvrk_drake.models.ranges import suggest_name
 
 #: Largest distance of a locked joint from its stated position in a recording [rad, m].
 MAX_LOCKED_ERROR = 0.02

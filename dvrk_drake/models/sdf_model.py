@@ -14,7 +14,7 @@ from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm_schema import EFFORTS
 from dvrk_drake.models.immutable import cached
 from dvrk_drake.models.model_file import MODEL_SUFFIXES, convert_model
-from dvrk_drake.models.schema_fault import Range
+from dvrk_drake.models.ranges import Range
 from dvrk_drake.models.sdf_elements import BASE_LINK, DRAKE, read_xml
 
 MODELS_FOLDER = Path(__file__).parent

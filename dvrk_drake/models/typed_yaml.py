@@ -12,7 +12,7 @@ import yaml
 
 from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.models.files import read_text_input
-from dvrk_drake.models.schema_fault import RANGE, Range, quoted, suggest_name
+from dvrk_drake.models.ranges import RANGE, Range, quoted, suggest_name
 
 Schema = TypeVar("Schema")
 

@@ -21,7 +21,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import known_arms, load_arm
 from dvrk_drake.models.environment import Environment
 from dvrk_drake.models.files import atomic_write, read_text_input
-from dvrk_drake.models.schema_fault import number_fault, within
+from dvrk_drake.models.ranges import number_fault, within
 from dvrk_drake.models.typed_yaml import load_typed_yaml
 from dvrk_drake.recordings import motion_parts
 from dvrk_drake.recordings.periodic_motion import PeriodicMotion

@@ -13,7 +13,7 @@ from dvrk_drake.errors import CollectionError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.approach import offset_pose
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.schema_fault import number_fault, within
+from dvrk_drake.models.ranges import number_fault, within
 from dvrk_drake.processes.arm_controller import ArmController, GoalController, MotionStyle
 from dvrk_drake.processes.arm_mover import REST_TIME, SETTLE, ArmMover, Steps
 from dvrk_drake.recordings.pose_file import CollectionFile

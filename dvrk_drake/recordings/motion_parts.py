@@ -16,7 +16,7 @@ from dvrk_drake.errors import CollectionError, RecordingError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import atomic_write, open_input
-from dvrk_drake.models.schema_fault import within
+from dvrk_drake.models.ranges import within
 from dvrk_drake.models.typed_yaml import load_typed_yaml
 from dvrk_drake.recordings.csv_rows import parse_finite
 from dvrk_drake.recordings.growing_file import GrowingFile, csv_line

@@ -15,7 +15,7 @@ from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.environment import Environment
 from dvrk_drake.models.files import atomic_write, refuse_existing
-from dvrk_drake.models.schema_fault import within
+from dvrk_drake.models.ranges import within
 from dvrk_drake.models.typed_yaml import load_yaml, typed_content
 
 #: Largest velocity and acceleration at both ends of a motion in a file, as a share of the largest values in the motion.

@@ -15,7 +15,7 @@ from dvrk_drake.dynamics.kinematics import ArmFrame
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_schema import IMPLAUSIBLE
-from dvrk_drake.models.schema_fault import number_fault, within
+from dvrk_drake.models.ranges import number_fault, within
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from dvrk_drake.models.arm_schema import GRAVITIES
 from dvrk_drake.models.effect_kinds import POSITION_KINDS
 from dvrk_drake.models.effects_schema import ArmEffects, DriveEffect
 from dvrk_drake.models.loop_closure import Closure
-from dvrk_drake.models.schema_fault import number_fault, within
+from dvrk_drake.models.ranges import number_fault, within
 from dvrk_drake.models.typed_yaml import load_yaml, typed_content
 from dvrk_drake.systems.arm_station import arm_plant_config
 from dvrk_drake.systems.ideal_drive import plant_config_fault

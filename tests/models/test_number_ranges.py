@@ -33,7 +33,7 @@ from dvrk_drake.models.arm_schema import (
     load_gains,
 )
 from dvrk_drake.models.effects_schema import ArmEffects, FrictionEffect
-from dvrk_drake.models.schema_fault import RANGE, Range, number_fault, within
+from dvrk_drake.models.ranges import RANGE, Range, number_fault, within
 from dvrk_drake.models.sdf_model import _RANGES, MODELS_FOLDER
 from dvrk_drake.processes.collector import CollectionSettings
 from dvrk_drake.processes.simulated_arm import load_driver

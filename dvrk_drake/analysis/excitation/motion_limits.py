@@ -15,7 +15,7 @@ from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_schema import POSITIONS
 from dvrk_drake.models.environment import Environment
-from dvrk_drake.models.schema_fault import number_fault, within
+from dvrk_drake.models.ranges import number_fault, within
 from dvrk_drake.models.soft_walls import SoftWalls
 from dvrk_drake.recordings.periodic_motion import PeriodicMotion
 

@@ -15,7 +15,7 @@ from dvrk_drake.errors import StudyError
 from dvrk_drake.experiments.scenario import Scenario
 from dvrk_drake.experiments.simulation import Simulation
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.schema_fault import number_fault, within
+from dvrk_drake.models.ranges import number_fault, within
 
 
 @dataclass

@@ -21,7 +21,7 @@ from dvrk_drake.errors import DvrkDrakeError, StudyError
 from dvrk_drake.experiments.scenario import Scenario, check_pose, load_scenario
 from dvrk_drake.experiments.study.measures import Measure
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.schema_fault import number_fault, within
+from dvrk_drake.models.ranges import number_fault, within
 from dvrk_drake.models.sdf_model import compose_sdf
 from dvrk_drake.models.typed_yaml import load_typed_yaml
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.schema_fault import number_fault, within
+from dvrk_drake.models.ranges import number_fault, within
 
 #: Settings that protect an arm less if they are smaller. All other settings protect it less if they are larger.
 _WEAKER_IF_SMALLER = frozenset(

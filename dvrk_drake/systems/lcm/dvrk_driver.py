@@ -11,7 +11,7 @@ from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import MessageKey
-from dvrk_drake.models.schema_fault import number_fault, within
+from dvrk_drake.models.ranges import number_fault, within
 from dvrk_drake.systems.guard.settings import GuardSettings
 
 _MODES = {

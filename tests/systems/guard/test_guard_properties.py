@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.models.schema_fault import RANGE
+from dvrk_drake.models.ranges import RANGE
 from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.guard.settings import GuardSettings, PlausibilitySettings
 from dvrk_drake.systems.guard.states import Event
