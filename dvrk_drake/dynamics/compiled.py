@@ -115,12 +115,6 @@ def cross(a, b):  # pragma: no cover - compiled
 
 
 @compiled
-def times(R, a):  # pragma: no cover - compiled
-    """Returns R a for a matrix R, which is a tuple of three rows."""
-    return dot(R[0], a), dot(R[1], a), dot(R[2], a)
-
-
-@compiled
 def transposed_times(R, a):  # pragma: no cover - compiled
-    """Returns R' a."""
+    """Returns R' a for a matrix R, which is a tuple of three rows."""
     return add(add(scale(a[0], R[0]), scale(a[1], R[1])), scale(a[2], R[2]))

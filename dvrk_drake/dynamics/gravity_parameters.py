@@ -16,7 +16,7 @@ from pydrake.multibody.tree import Joint, RigidBody
 from dvrk_drake.dynamics.base_parameters import BaseParameters, StandardParameter, reduce_to_base
 from dvrk_drake.dynamics.inertial_parameters import link_inertias, moving_bodies, rotor_links
 from dvrk_drake.dynamics.kinematic_tree import KinematicTree
-from dvrk_drake.dynamics.regressor_kernel import fill_gravity_regressor
+from dvrk_drake.dynamics.regressor_kernel import fill_regressor
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import arm_frames, base_body, shared_plant
@@ -64,9 +64,9 @@ class GravityParameters:
 
     @cached_property
     def columns(self) -> NDArray[np.int64]:
-        """Column (b,) of each base parameter in the regressor at rest, which has the columns m and h of each link."""
+        """Column (b,) of each base parameter in the regressor of the dynamics, which has ten columns per link."""
         kept = np.array(self.base.columns)
-        return 4 * self.link_rows[kept // 4] + kept % 4
+        return 10 * self.link_rows[kept // 4] + kept % 4
 
     def regressor_at(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns the regressor Y (m, n, b) of the base parameters at poses q (m, n) [rad, m]."""
@@ -74,9 +74,9 @@ class GravityParameters:
 
     def weights(self, beta: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns masses and first moments (l, 4) of the links of `tree` that have the base parameters beta (b,)."""
-        weights = np.zeros(4 * len(self.tree.links))
-        weights[self.columns] = beta
-        return weights.reshape(-1, 4)
+        parameters = np.zeros(10 * len(self.tree.links))
+        parameters[self.columns] = beta
+        return parameters.reshape(-1, 10)[:, :4]
 
 
 @cache
@@ -110,7 +110,7 @@ def gravity_parameters(arm: Arm, frames: str = "dh", serial: bool = False) -> Gr
     parameters = [StandardParameter(label, axis) for label in kept for axis in ("", "x", "y", "z")]
     lengths = named_lengths(arm, labels, frames)
     poses = np.random.default_rng(0).uniform(-2, 2, (4 * len(kept) + 10, arm.num_joints))
-    columns = (4 * link_rows[:, None] + np.arange(4)).ravel()
+    columns = (10 * link_rows[:, None] + np.arange(4)).ravel()
     regressor = _regressor_at_rest(tree, arm.gravity / size, columns, poses).reshape(-1, len(columns))
     immobile = {label for label, row in zip(kept, link_rows, strict=True) if not np.any(tree.G[row])}
     return GravityParameters(
@@ -125,18 +125,14 @@ def gravity_parameters(arm: Arm, frames: str = "dh", serial: bool = False) -> Gr
 
 
 def _regressor_at_rest(
-    tree: KinematicTree,
-    gravity: NDArray[np.float64],
-    columns: Sequence[int] | NDArray[np.int64],
-    q: NDArray[np.float64],
+    tree: KinematicTree, gravity: NDArray[np.float64], columns: NDArray[np.int64], q: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Returns some columns (m, n, b) of the regressor of m and h of all links at poses q (m, n)."""
-    place = np.full(4 * len(tree.links), -1)
-    place[columns] = np.arange(len(columns))
-    Y = np.empty((*q.shape, len(columns)))
+    """Returns some columns (m, n, b) of the regressor of the dynamics at rest, at poses q (m, n)."""
     q = np.ascontiguousarray(q, dtype=np.float64)
-    fill_gravity_regressor(q, gravity, tree.arrays, place.reshape(-1, 4), Y)
-    return Y
+    rest, num_joints = np.zeros_like(q), q.shape[1]
+    Y = np.empty((*q.shape, 10 * len(tree.links)))
+    fill_regressor(q, rest, rest, gravity, tree.arrays, np.empty((0, 2, num_joints)), Y)
+    return Y[..., columns]
 
 
 def _to_standard(arm: Arm, bodies: Sequence[tuple[RigidBody, RigidTransform]]) -> NDArray[np.float64]:

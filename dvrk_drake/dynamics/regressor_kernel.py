@@ -1,4 +1,4 @@
-"""Compiled recursion over the links of an arm: regressor of the dynamics, and regressor at rest.
+"""Compiled recursion over the links of an arm that computes the regressor of the dynamics.
 
 All arms use the same compiled code. The arrays of a `KinematicTree` describe the arm. A link C has the parent P and the
 pose X_PC = (R, p). Its motion and its hinge are expressed in C:
@@ -12,10 +12,10 @@ its origin Co. With the acceleration a = du + w x u of Co, the link needs
 
     force  m a + dw x h + w x (w x h)    and moment  h x a + I dw + w x I w    about Co.
 
-Gravity is represented by an upward acceleration of the base. At rest, most of this is zero; see
-`fill_gravity_regressor`. Reference: Featherstone, "Rigid Body Dynamics Algorithms" (2008), 5.3.
+Gravity is represented by an upward acceleration of the base. Reference: Featherstone, "Rigid Body Dynamics Algorithms"
+(2008), 5.3.
 
-The regressors process blocks of `BLOCK` samples. Each number of the recursion is a row with its values for all samples
+The recursion processes blocks of `BLOCK` samples. Each number of the recursion is a row with its values for all samples
 of a block, so that the compiler can vectorise the loops over a block. It does so only if each loop writes to one array.
 Row k of an array `rows` begins at index k * BLOCK, because the compiler must know the distance of two rows.
 """
@@ -37,7 +37,6 @@ from dvrk_drake.dynamics.compiled import (
     read_only,
     scale,
     sin_cos,
-    times,
     transposed_times,
 )
 
@@ -48,7 +47,7 @@ BLOCK = 64
 _W, _U, _DW, _DU, _A = 0, 3, 6, 9, 12
 #: Number of rows of a link, of the Jacobian column (w, u) of a joint, and of a pose (three rows of R, then p).
 _LINK_ROWS, _JACOBIAN_ROWS, _POSE_ROWS = 15, 6, 12
-#: Rows of a joint coordinate: x, sin(x), 1 - cos(x), dx/dt and d2x/dt2. The last two are 0 at rest.
+#: Rows of a joint coordinate: x, sin(x), 1 - cos(x), dx/dt and d2x/dt2.
 _X, _SINE, _VERSINE, _RATE, _ACCELERATION, _JOINT_ROWS = 0, 1, 2, 3, 4, 5
 
 
@@ -135,7 +134,7 @@ def _fill_samples(rows, samples):  # pragma: no cover - compiled
 
 @compiled
 def _move_joint(G, c, motion, joint):  # pragma: no cover - compiled
-    """Fills the rows of the joint coordinate x = G q + c from the rows of q, v and vd, or of q only."""
+    """Fills the rows of the joint coordinate x = G q + c from the rows of q, v and vd."""
     joint[:] = 0.0
     for s in range(BLOCK):
         joint[_X * BLOCK + s] = c
@@ -144,10 +143,9 @@ def _move_joint(G, c, motion, joint):  # pragma: no cover - compiled
         if g != 0.0:
             for s in range(BLOCK):
                 joint[_X * BLOCK + s] += g * motion[0, j * BLOCK + s]
-            if len(motion) == 3:
-                for s in range(BLOCK):
-                    joint[_RATE * BLOCK + s] += g * motion[1, j * BLOCK + s]
-                    joint[_ACCELERATION * BLOCK + s] += g * motion[2, j * BLOCK + s]
+            for s in range(BLOCK):
+                joint[_RATE * BLOCK + s] += g * motion[1, j * BLOCK + s]
+                joint[_ACCELERATION * BLOCK + s] += g * motion[2, j * BLOCK + s]
     for s in range(BLOCK):
         sine, cosine = sin_cos(joint[_X * BLOCK + s])
         joint[_SINE * BLOCK + s], joint[_VERSINE * BLOCK + s] = sine, 1.0 - cosine
@@ -271,92 +269,3 @@ def fill_regressor(q, v, vd, gravity, tree, rotors, out):  # pragma: no cover - 
                     _fill_samples(torques, part[:, j, 10 * i : 10 * i + 10])
         for k in range(len(rotors)):
             _rotor_torques(rotors[k, 0], rotors[k, 1], motion[2], part[:, :, 10 * num_links + k])
-
-
-@compiled
-def _place_in_base(X, P, C):  # pragma: no cover - compiled
-    """Fills the rows of the pose X_BC = X_BP X_PC of link C in the base frame B."""
-    for s in range(BLOCK):
-        R, p = _pose(X, s)
-        R_BP, p_BP = _pose(P, s)
-        for k in range(3):
-            _store(C, 3 * k, s, transposed_times(R, R_BP[k]))
-        _store(C, 9, s, add(times(R_BP, p), p_BP))
-
-
-@compiled
-def _weight_on_hinge(C, H, gravity, hinge):  # pragma: no cover - compiled
-    """Fills the rows of b and c. The torque about the hinge of C is b . r - c per unit mass at the point r in B."""
-    H_w, H_u = _hinge(H)
-    g = (gravity[0], gravity[1], gravity[2])
-    for s in range(BLOCK):
-        R, p = _pose(C, s)
-        b = cross(times(R, H_w), g)
-        _store(hinge, 0, s, b)
-        hinge[3 * BLOCK + s] = dot(p, b) + dot(g, times(R, H_u))
-
-
-@compiled
-def _torques_of_weight(C, weight, torques):  # pragma: no cover - compiled
-    """Fills four rows: the torque per unit of m and h of link C, from the rows of b and c of an independent joint."""
-    for s in range(BLOCK):
-        R, p = _pose(C, s)
-        b = _vector(weight, 0, s)
-        torques[s] = dot(p, b) - weight[3 * BLOCK + s]
-        _store(torques, 1, s, transposed_times(R, b))
-
-
-@compiled_for(read_only(2), read_only(1), TREE, numba.int64[:, ::1], _number[:, :, ::1])
-def fill_gravity_regressor(q, gravity, tree, columns, out):  # pragma: no cover - compiled
-    """Computes columns of the regressor of an arm at rest. It equals `fill_regressor`, without all that is zero.
-
-    The torque of independent joint j due to a link is the sum of the torques about the hinges of the link and of the
-    links that carry it, each multiplied by its element of G.
-
-    Args:
-        q: Positions (m, n) of the independent joints [rad, m].
-        gravity: Gravity vector (3,) in the base frame [m/s^2].
-        tree: Arrays of the arm's `KinematicTree`.
-        columns: Index (l, 4) of the column of `out` for m and h of each link, or -1 to omit the parameter.
-        out: Array (m, n, columns) that receives the regressor. Previous values are overwritten.
-    """
-    num_links, n = tree.G.shape
-    motion = np.zeros((1, n * BLOCK))
-    joint = np.empty(_JOINT_ROWS * BLOCK)
-    X = np.empty(_POSE_ROWS * BLOCK)
-    links = np.empty((num_links, _POSE_ROWS * BLOCK))
-    hinge = np.empty(4 * BLOCK)
-    weights = np.empty((num_links, n, 4 * BLOCK))
-    torques = np.empty(4 * BLOCK)
-    base = np.zeros(_POSE_ROWS * BLOCK)
-    for k in range(3):
-        base[4 * k * BLOCK : (4 * k + 1) * BLOCK] = 1.0
-    # Link whose hinge moved last, from the base to each link, by each independent joint.
-    last = np.empty((num_links, n), np.int64)
-    for start in range(0, len(q), BLOCK):
-        part = out[start : start + BLOCK]
-        part.reshape(-1)[:] = 0.0
-        _fill_rows(q[start : start + BLOCK], motion[0])
-        for i in range(num_links):
-            parent = tree.parents[i]
-            _move_joint(tree.G[i], tree.c[i], motion, joint)
-            _place_link(tree.pose_terms[i], joint, X)
-            _place_in_base(X, links[parent] if parent >= 0 else base, links[i])
-            _weight_on_hinge(links[i], tree.hinges[i], gravity, hinge)
-            has_columns = False
-            for k in range(4):
-                has_columns |= columns[i, k] >= 0
-            for j in range(n):
-                before = last[parent, j] if parent >= 0 else -1
-                factor = tree.G[i, j]
-                last[i, j] = i if factor != 0.0 else before
-                if factor != 0.0:
-                    for s in range(4 * BLOCK):
-                        weights[i, j, s] = factor * hinge[s] + (weights[before, j, s] if before >= 0 else 0.0)
-                if last[i, j] >= 0 and has_columns:
-                    _torques_of_weight(links[i], weights[last[i, j], j], torques)
-                    for k in range(4):
-                        column = columns[i, k]
-                        if column >= 0:
-                            for s in range(len(part)):
-                                part[s, j, column] = torques[k * BLOCK + s]
