@@ -40,6 +40,7 @@ from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.recalibration import cross_validated_errors
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_section import ActuatorStatistics
+from dvrk_drake.dynamics.inertial_parameters import pseudo_inertia
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
@@ -101,7 +102,8 @@ def main() -> None:
         box = (arm.position_lower, arm.position_upper)
         q = np.random.default_rng(0).uniform(*box, (options.poses, arm.num_joints))
         least = float(np.linalg.eigvalsh(DynamicModel(arm, dynamics).mass_matrix(q)).min())
-        print(f"smallest eigenvalue of all pseudo-inertias: {min(e.least_eigenvalue for e in dynamics.links):.1e}\n")
+        eigenvalues = [np.linalg.eigvalsh(pseudo_inertia(link.parameters))[0] for link in dynamics.links]
+        print(f"smallest eigenvalue of all pseudo-inertias: {min(eigenvalues):.1e}\n")
         print(f"smallest eigenvalue of M(q) at {len(q)} random poses: {least:.1e}\n")
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         print(f"processor time of the identification: {seconds:.1f} s; peak memory of this process: {peak:.0f} MB\n")

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 
-from dvrk_drake.analysis.check.findings import Finding
 from dvrk_drake.analysis.check.mounting import find_mounting, is_assumed
 from dvrk_drake.analysis.check.recording_check import require_usable, with_power
 from dvrk_drake.analysis.dynamic.dynamic_identification import DynamicIdentification, identify_dynamic
 from dvrk_drake.analysis.effects_at_rest import MIN_NUM_POSES, with_effects_at_rest
-from dvrk_drake.analysis.observations.observations import Observations
-from dvrk_drake.analysis.static.gravity_direction import LARGE_TILT, GravityDirection
+from dvrk_drake.analysis.observations.finding import Finding
+from dvrk_drake.analysis.observations.observations import Observations, Poses
+from dvrk_drake.analysis.static.gravity_direction import LARGE_TILT
 from dvrk_drake.analysis.static.gravity_direction import estimate_gravity as gravity_direction
 from dvrk_drake.analysis.static.static_identification import Method, StaticIdentification, identify_static
 from dvrk_drake.analysis.verdict import unexplained_effort
@@ -82,105 +83,39 @@ def identify(
         ...     print(warning)
         >>> result.save("model.yaml")
     """
-    if estimate_gravity:
-        arm = replace(arm, identification=replace(arm.identification, base_may_tilt=True))
-    if not isinstance(recording, Recording):
-        if len(recording) != 1:
-            if method != "robust":
-                raise RecordingError(f'method "{method}": requires one recording, but {len(recording)} were given')
-            return _identify_several(recording, arm, progress)
-        (recording,) = recording
-    recording, dropped = with_power(recording, arm)
-    if is_assumed(arm):
-        arm, mounting = find_mounting(Observations(recording, arm))
-        dropped = (*dropped, *mounting)
-    poses = Observations(recording, arm).poses()
-    report = require_usable(poses.observations, progress, channels=True)
-    share = step_progress(progress, "identifying")
-    try:
-        if poses.moves:
-            motion = identify_dynamic([poses.observations], share)
-            return replace(motion, warnings=(*dropped, *report.warnings, *_unexplained(motion)))
-        direction = gravity_direction(poses.recording, arm)
-        if estimate_gravity:
-            arm = _with_estimated_gravity(arm, direction, report.source)
-        static = identify_static(poses.recording, arm, method, share)
-    except DvrkDrakeError as error:
-        error.findings = (*dropped, *report.warnings)
-        raise
-    note = poses.note
-    if estimate_gravity:
-        note = f"{note} Gravity in the base frame, estimated from the poses: {direction} from the arm file.".strip()
-    tilted = () if estimate_gravity else _tilt_warning(direction, report.source)
-    if tilted:
-        static.model.provenance.base_tilt = f"gravity estimated from the poses: {direction} from the assumed direction"
-    warnings = (*dropped, *report.warnings, *tilted)
-    return replace(static, warnings=warnings, note=note, num_rows=len(poses.recording))
-
-
-def _with_estimated_gravity(arm: Arm, direction: GravityDirection, source: str) -> Arm:
-    if not direction.is_determined:
-        raise IdentificationError(
-            f"{source}: the poses do not determine the direction of gravity: {direction} from the arm file; at most +- "
-            f"{np.rad2deg(LARGE_TILT):g} deg is allowed. Measure the tilt of the base and give the gravity vector, "
-            "or record more poses over larger ranges."
-        )
-    return arm.with_gravity(direction.gravity.tolist())
-
-
-def _tilt_warning(direction: GravityDirection, source: str) -> tuple[Finding, ...]:
-    if not direction.is_large:
-        return ()
-    what = (
-        f"the base seems to be tilted by more than {np.rad2deg(LARGE_TILT):g} deg. Gravity estimated from the poses: "
-        f"{direction} from the assumed direction. Cable terms of the model replace part of the tilt, so the model is "
-        "wrong at other poses and in an exported file"
-    )
-    advice = "Measure the tilt and identify again with --gravity X Y Z."
-    if direction.is_determined:
-        advice = "Identify again with --gravity X Y Z, or with --gravity estimate."
-    return (Finding("warning", "base tilt", source, what, advice),)
-
-
-def _identify_several(recordings: Sequence[Recording], arm: Arm, progress: Progress | None) -> DynamicIdentification:
+    recordings = [recording] if isinstance(recording, Recording) else list(recording)
     if not recordings:
         raise RecordingError("no recordings were given; a model requires at least one")
-    motions: list[tuple[str, Observations]] = []
-    static: list[tuple[str, Observations]] = []
+    if len(recordings) > 1 and method != "robust":
+        raise RecordingError(f'method "{method}": requires one recording, but {len(recordings)} were given')
+    if estimate_gravity:
+        arm = replace(arm, identification=replace(arm.identification, base_may_tilt=True))
+    names = [own.source or f"recording {i}" for i, own in enumerate(recordings, start=1)]
     warnings: list[Finding] = []
+
+    def warn(name: str, findings: Iterable[Finding]) -> None:
+        warnings.extend(finding.within(name) if len(recordings) > 1 else finding for finding in findings)
+
+    for k, name in enumerate(names):
+        recordings[k], dropped = with_power(recordings[k], arm)
+        warn(name, dropped)
     if is_assumed(arm):
-        arm, mounting = find_mounting(Observations(with_power(recordings[0], arm)[0], arm))
+        arm, mounting = find_mounting(Observations(recordings[0], arm))
         warnings += mounting
-    for i, whole in enumerate(recordings):
-        recording, dropped = with_power(whole, arm)
-        name = recording.source or f"recording {i + 1}"
-        warnings += [replace(finding, where=f"{name}: {finding.where}") for finding in dropped]
-        found = Observations(recording, arm).poses()
-        if not found.moves and (static or (i == len(recordings) - 1 and not motions)):
-            also = f", and so does {static[0][0]}" if static else ""
-            raise RecordingError(
-                f"{name}: contains static poses, or is sampled too slowly for a motion{also}; several recordings can "
-                "be combined only if all of them, or all but one, are motions"
-            )
-        for other_name, other in motions if found.moves else ():
-            if _num_common_rows(recording, other.recording) > MAX_COMMON_ROWS * min(
-                len(recording), len(other.recording)
-            ):
-                raise RecordingError(
-                    f"{name}: contains the same efforts as {other_name}; give different recordings, because each of "
-                    "them is predicted from the others"
-                )
-        (motions if found.moves else static).append((name, found.observations))
-    for name, observations in motions + static:
-        report = require_usable(observations, progress, channels=True)
-        warnings += [replace(finding, where=f"{name}: {finding.where}") for finding in report.warnings]
+    motions, static = _motions_and_poses(names, [Observations(own, arm).poses() for own in recordings])
+    for name, poses in motions + static:
+        report = require_usable(poses.observations, progress, channels=True)
+        warn(name, report.warnings)
     share = step_progress(progress, "identifying")
     try:
-        result = identify_dynamic([motion for _, motion in motions], lambda done: share(0.95 * done))
-        for _, observations in static:
-            poses = identify_static(observations.recording, arm)
-            model = with_effects_at_rest(result.model, poses)
-            result = replace(result, model=model, note=_note(model, len(poses.recording)))
+        if not motions:
+            identified = _identify_poses(static[0][1], method, estimate_gravity, share)
+            return replace(identified, warnings=(*warnings, *identified.warnings))
+        result = identify_dynamic([motion.observations for _, motion in motions], lambda done: share(0.95 * done))
+        for _, poses in static:
+            at_rest = identify_static(poses.recording, arm)
+            model = with_effects_at_rest(result.model, at_rest)
+            result = replace(result, model=model, note=_note(model, len(at_rest.recording)))
         share(1.0)
     except DvrkDrakeError as error:
         error.findings = tuple(warnings)
@@ -188,16 +123,67 @@ def _identify_several(recordings: Sequence[Recording], arm: Arm, progress: Progr
     return replace(result, warnings=(*warnings, *_unexplained(result)))
 
 
+def _motions_and_poses(
+    names: Sequence[str], recordings: Sequence[Poses]
+) -> tuple[list[tuple[str, Poses]], list[tuple[str, Poses]]]:
+    """Returns the motions and the static poses among the named recordings.
+
+    Raises:
+        RecordingError: Several recordings contain static poses, or two motions have the same efforts.
+    """
+    named = list(zip(names, recordings, strict=True))
+    motions, static = ([(name, own) for name, own in named if own.moves == moves] for moves in (True, False))
+    if len(static) > 1:
+        raise RecordingError(
+            f"{static[1][0]}: contains static poses, or is sampled too slowly for a motion, and so does "
+            f"{static[0][0]}; several recordings can be combined only if all of them, or all but one, are motions"
+        )
+    for (name, own), (other_name, other) in combinations(motions, 2):
+        pair = own.recording, other.recording
+        efforts = [{row.tobytes() for row in x.measured_effort().round(9) if row.any()} for x in pair]
+        if len(efforts[0] & efforts[1]) > MAX_COMMON_ROWS * min(map(len, pair)):
+            raise RecordingError(
+                f"{other_name}: contains the same efforts as {name}; give different recordings, because each of them "
+                "is predicted from the others"
+            )
+    return motions, static
+
+
+def _identify_poses(
+    poses: Poses, method: Method, estimate_gravity: bool, progress: Callable[[float], object]
+) -> StaticIdentification:
+    """Returns the static model, with a warning if the base seems to be tilted."""
+    arm, source, note = poses.observations.arm, poses.observations.source, poses.note
+    direction, limit = gravity_direction(poses.recording, arm), f"{np.rad2deg(LARGE_TILT):g} deg"
+    if estimate_gravity:
+        if not direction.is_determined:
+            raise IdentificationError(
+                f"{source}: the poses do not determine the direction of gravity: {direction} from the arm file; at "
+                f"most +- {limit} is allowed. Measure the tilt of the base and give the gravity vector, or record more "
+                "poses over larger ranges."
+            )
+        arm = arm.with_gravity(direction.gravity.tolist())
+        note = f"{note} Gravity in the base frame, estimated from the poses: {direction} from the arm file.".strip()
+    static = identify_static(poses.recording, arm, method, progress)
+    static = replace(static, note=note, num_rows=len(poses.recording))
+    if estimate_gravity or not direction.is_large:
+        return static
+    static.model.provenance.base_tilt = f"gravity estimated from the poses: {direction} from the assumed direction"
+    what = (
+        f"the base seems to be tilted by more than {limit}. Gravity estimated from the poses: {direction} from the "
+        "assumed direction. Cable terms of the model replace part of the tilt, so the model is wrong at other poses "
+        "and in an exported file"
+    )
+    advice = "Measure the tilt and identify again with --gravity X Y Z."
+    if direction.is_determined:
+        advice = "Identify again with --gravity X Y Z, or with --gravity estimate."
+    return replace(static, warnings=(Finding("warning", "base tilt", source, what, advice),))
+
+
 def _note(model: IdentifiedModel, num_poses: int) -> str:
     effects = ", ".join(f"{ActuatorEffect.of(e)} {e.coefficient:+.4f}" for e in model.effects)
     few = f" ({MIN_NUM_POSES} poses are required)" if num_poses < MIN_NUM_POSES else ""
     return f"Corrections of the holding torque from {num_poses} static poses [N m; N]: {effects or 'none'}{few}."
-
-
-def _num_common_rows(a: Recording, b: Recording) -> int:
-    """Returns the number of different effort rows that two recordings have in common, without rows of zeros."""
-    rows = [{row.tobytes() for row in x.measured_effort().round(9) if row.any()} for x in (a, b)]
-    return len(rows[0] & rows[1])
 
 
 def _unexplained(result: DynamicIdentification) -> tuple[Finding, ...]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.check.findings import Finding
+from dvrk_drake.analysis.observations.finding import Finding
 from dvrk_drake.analysis.verdict import Requirement, unfit, worst
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, ValidationSummary, Verdict
 from dvrk_drake.errors import DvrkDrakeError, ModelError
@@ -63,6 +64,26 @@ class Identification(ModelResult, Reportable):
     num_rows: int = 0
 
 
+@dataclass(frozen=True, kw_only=True)
+class JudgedError(ABC):
+    """Error of the efforts of one joint or actuator over a recording.
+
+    Attributes:
+        name: Name of the joint.
+        coverage: Share of the range between the limits that the recording covers, see `verdict.coverage` [1].
+        verdict: Verdict from the error, see `judge`.
+    """
+
+    name: str
+    coverage: float
+    verdict: Verdict
+
+    @property
+    @abstractmethod
+    def judged_error(self) -> float | None:
+        """Ratio of RMS error to RMS measured effort for the verdict [1], None if the effort is 0."""
+
+
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Validation(Reportable, ABC):
     """Result of `validate`: a `StaticValidation` or a `DynamicValidation`.
@@ -81,16 +102,21 @@ class Validation(Reportable, ABC):
 
     @property
     @abstractmethod
-    def verdicts(self) -> dict[str, Verdict]:
-        """Verdict on each joint, see `dvrk_drake.analysis.verdict`."""
+    def errors(self) -> Sequence[JudgedError]:
+        """Errors of the joints, in the arm's order."""
 
     @property
-    @abstractmethod
+    def verdicts(self) -> dict[str, Verdict]:
+        """Verdict on each joint, see `dvrk_drake.analysis.verdict`."""
+        return {error.name: error.verdict for error in self.errors}
+
+    @property
     def relative_errors(self) -> dict[str, float | None]:
         """Ratio of RMS error to RMS measured effort of each joint [1], None if the effort is 0.
 
         Excluded measurements are not used.
         """
+        return {error.name: error.judged_error for error in self.errors}
 
     @property
     def verdict(self) -> Verdict:

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from dvrk_drake.analysis.check.findings import Finding
 from dvrk_drake.analysis.check.recording_check import require_usable, with_power
 from dvrk_drake.analysis.dynamic.validation import (
     DynamicValidation,
@@ -14,6 +13,7 @@ from dvrk_drake.analysis.dynamic.validation import (
     predict_motion,
     validate_motion,
 )
+from dvrk_drake.analysis.observations.finding import Finding
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.results import Prediction
 from dvrk_drake.analysis.static.static_identification import MIN_POSES

@@ -13,7 +13,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.check.findings import Finding
+from dvrk_drake.analysis.observations.finding import Finding
 from dvrk_drake.dynamics.friction_compensation import HOLDING_ERROR_FACTOR, HOLDING_TRAVEL
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
 from dvrk_drake.models.arm import Arm

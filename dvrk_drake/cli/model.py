@@ -28,8 +28,7 @@ def equations(
         format: Generate source code of the gravity torque and its regressor in this language.
         output: File for the source code. Default: standard output.
     """
-    from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
-    from dvrk_drake.dynamics.symbolic_plant import SymbolicPlant
+    from dvrk_drake.dynamics.symbolic_gravity import SymbolicPlant, derive_gravity
     from dvrk_drake.export import gravity_sources
     from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.models.files import atomic_write

@@ -35,7 +35,7 @@ from dvrk_drake.errors import ArmError, DvrkDrakeError, ModelError
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
 
-    from dvrk_drake.analysis.check.findings import Finding
+    from dvrk_drake.analysis.observations.finding import Finding
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.models.arm import Arm
     from dvrk_drake.models.environment import Environment

@@ -13,11 +13,6 @@ from dvrk_drake.models.effect_kinds import POSITION_KINDS
 from dvrk_drake.models.effects_schema import DriveEffect
 
 
-def depends_on_position(effect: DriveEffect) -> bool:
-    """Returns whether the torque of an effect depends on the position only, which excludes friction."""
-    return effect.kind in POSITION_KINDS
-
-
 def friction_curve(
     effects: Sequence[DriveEffect], coordinate: str, v: NDArray[np.float64], load: float = 0.0, x: float = 0.0
 ) -> NDArray[np.float64]:
@@ -34,7 +29,7 @@ def friction_curve(
     """
     torque = np.zeros(len(v))
     for e in effects:
-        if e.coordinate == coordinate and not depends_on_position(e):
+        if e.coordinate == coordinate and e.kind not in POSITION_KINDS:
             effect = ActuatorEffect.of(e)
             # After an infinite travel, the deflection of a presliding element has its final value.
             travel = [math.copysign(math.inf, speed) if speed else 0.0 for speed in v]
@@ -51,5 +46,5 @@ def position_curve(effects: Sequence[DriveEffect], coordinate: str, x: NDArray[n
         coordinate: Key of `Arm.effect_coordinates`.
         x: Positions of the coordinate.
     """
-    own = [e for e in effects if e.coordinate == coordinate and depends_on_position(e)]
+    own = [e for e in effects if e.coordinate == coordinate and e.kind in POSITION_KINDS]
     return sum((e.coefficient * ActuatorEffect.of(e).column(x, 0 * x) for e in own), np.zeros(len(x)))

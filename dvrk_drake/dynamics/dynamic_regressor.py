@@ -29,7 +29,8 @@ from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import shared_plant
 
-#: Number of samples in a chunk, for which `torque` computes one regressor.
+#: Number of samples in a chunk, for which `torque` computes one regressor: four blocks of the compiled recursion
+#: (`BLOCK`). The regressor of a PSM then has 2 MB, which fits into the cache of a core.
 _CHUNK = 256
 
 

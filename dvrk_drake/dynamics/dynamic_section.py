@@ -25,7 +25,6 @@ class LinkEstimate:
     Attributes:
         link: Name of the link.
         parameters: Estimated inertial parameters (10,).
-        least_eigenvalue: Smallest eigenvalue of the pseudo-inertia. It is positive for a physically consistent link.
         standard_errors: Standard errors (10,) of the individual parameters. The standard errors of base parameters are
             smaller.
         mass_identifiability: Relative reduction of the prior variance of the mass by the motion, 0 to 1. Near 0, the
@@ -35,7 +34,6 @@ class LinkEstimate:
 
     link: str = ""
     parameters: list[float] = field(default_factory=list, metadata=ESTIMATES)
-    least_eigenvalue: float = field(default=0.0, metadata=ESTIMATES)
     standard_errors: list[float] = field(default_factory=list, metadata=STANDARD_ERRORS)
     mass_identifiability: float = field(default=0.0, metadata=SHARES)
     bounds: list[str] = field(default_factory=list)

@@ -20,12 +20,16 @@ from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 #: Largest travel before sliding [rad], [m] of the presliding effects that are assumed to hold the arm at rest. It is
 #: the largest drift after a release that is accepted (figures 5, 6 and 8 in docs/benchmark_tables.md).
 HOLDING_TRAVEL = 0.015, 0.0015
-#: Largest `ActuatorEffect.scale` [rad/s], [m/s] of the Coulomb effects that are assumed to hold the arm at rest.
+#: Largest `ActuatorEffect.scale` [rad/s], [m/s] of the Coulomb effects that are assumed to hold the arm at rest. The
+#: widest effect of an identified model has 0.4 times the RMS speed of its recording, which is more for most joints of
+#: the public motions. With a larger scale, the arm would creep visibly: at 0.1 rad/s if the load is 40 % of the
+#: friction.
 HOLDING_SPEED = 0.25, 0.025
 #: Largest share of the friction that may be compensated. On another day, an arm may have a third less friction than
 #: identified (docs/dynamics.md). The compensation must never exceed the actual friction.
 MAX_RATIO = 0.6
-#: Largest share of the hysteresis effects (see `Friction.springs_back`) that may be compensated.
+#: Largest share of the hysteresis effects (see `Friction.springs_back`) that may be compensated. Overcompensation would
+#: be a negative spring. The total compensation along a coordinate is limited by `MAX_RATIO` anyway.
 MAX_HYSTERESIS_RATIO = 0.9
 #: Assumed ratio of the largest error of the holding torque to the leave-one-out RMS error of a model. On simulated
 #: arms, the actual ratio is rarely larger.

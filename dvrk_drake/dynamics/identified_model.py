@@ -54,23 +54,18 @@ _POSITIONS = within(-50.0, 50.0, "rad or m")
 class BaseParameterEstimate:
     """Estimate of a base parameter [kg m, or kg for a mass].
 
-    `degrees_of_freedom` are those of the standard error, None if they are unknown. `distinguishable` is true if the
-    95 % interval excludes 0.
+    `degrees_of_freedom` are those of the standard error, None if they are unknown.
     """
 
     name: str = ""
     value: float = field(default=0.0, metadata=ESTIMATES)
     standard_error: float = field(default=0.0, metadata=STANDARD_ERRORS)
-    distinguishable: bool = False
     degrees_of_freedom: float | None = field(default=None, metadata=FREEDOMS)
 
-    @classmethod
-    def of(
-        cls, name: str, value: float, standard_error: float, degrees_of_freedom: float | None
-    ) -> "BaseParameterEstimate":
-        """Returns an estimate, with the result of the comparison of its interval with 0."""
-        excludes_0 = abs(value) > half_width(standard_error, degrees_of_freedom)
-        return cls(name, float(value), float(standard_error), bool(excludes_0), degrees_of_freedom)
+    @property
+    def distinguishable(self) -> bool:
+        """True if the 95 % interval excludes 0."""
+        return abs(self.value) > half_width(self.standard_error, self.degrees_of_freedom)
 
 
 @dataclass
@@ -237,7 +232,7 @@ class IdentifiedModel(_Identified):
         return cls(
             arm=arm,
             base_parameters=[
-                BaseParameterEstimate(name, float(value), 0.0, True)
+                BaseParameterEstimate(name, float(value))
                 for name, value in zip(gravity.base.names, gravity.base_values, strict=True)
             ],
             effects=[replace(effect) for effect in effects],

@@ -23,7 +23,8 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import shared_plant
 
 #: Lower bound on the eigenvalues of Z, the pseudo-inertia of a link relative to the pseudo-inertia in the SDF (see
-#: `nearest_links`).
+#: `nearest_links`). Without it, the nearest links would be at the boundary of the consistent parameters, where rounding
+#: errors make an inertia inconsistent.
 MIN_EIGENVALUE_RATIO = 0.01
 #: Largest change of an element of Z that is considered a rounding error: ten times the tolerance of Clarabel (1e-8).
 _ROUNDING = 1e-7

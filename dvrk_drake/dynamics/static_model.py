@@ -28,11 +28,6 @@ class StaticModel:
     gravity: GravityParameters
     effects: tuple[ActuatorEffect, ...]
 
-    @property
-    def num_parameters(self) -> int:
-        """Length of theta."""
-        return len(self.gravity.base.names) + len(self.effects)
-
     def with_parameters(self, theta: ArrayLike) -> HoldingArrays:
         """Returns the model with parameters theta for `holding_torque_into`."""
         beta, coefficients = np.split(np.asarray(theta, dtype=np.float64), [len(self.gravity.base.names)])

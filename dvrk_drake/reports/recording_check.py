@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.check.findings import RecordingReport
+from dvrk_drake.analysis.check.report import RecordingReport
 from dvrk_drake.analysis.observations.noise import spectra
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.recording import Recording

@@ -11,7 +11,7 @@ from dvrk_drake.dynamics.base_parameters import independent_columns, reduce_to_b
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.gravity_parameters import gravity_parameters
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.dynamics.symbolic_plant import SymbolicPlant
+from dvrk_drake.dynamics.symbolic_gravity import SymbolicPlant
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import holding_torques
 

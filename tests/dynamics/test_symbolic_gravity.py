@@ -7,8 +7,7 @@ from paper_regressor import paper_regressor
 
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.static_model import static_model
-from dvrk_drake.dynamics.symbolic_gravity import GRAVITY, derive_gravity
-from dvrk_drake.dynamics.symbolic_plant import SymbolicPlant
+from dvrk_drake.dynamics.symbolic_gravity import GRAVITY, SymbolicPlant, derive_gravity
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.check.channel_fit import OFFSET_DEVIATION, ChannelFit
-from dvrk_drake.analysis.check.findings import Finding
+from dvrk_drake.analysis.observations.finding import Finding
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.static.excluded_measurements import find_excluded
 from dvrk_drake.analysis.static.static_identification import MIN_POSES, average_repeated_poses
@@ -44,10 +44,11 @@ SCALES = (0.5, 2.0)
 #: recordings of one PSM on two days have ratios between 0.96 and 1.54.
 FRICTION_FACTOR = 1.7
 #: Smallest reported position offset [rad], [m], and smallest ratio of a reported offset to its standard error. Half the
-#: offset gives a wrong warning for the public motion `mtm_one`.
+#: offset gives a wrong warning for the public motion `mtm_one`. A normal error exceeds the ratio once in 1000 joints.
 MIN_OFFSET, OFFSET_ERRORS = (0.06, 0.006), 3.3
 #: Largest duration of a segment [s]. A longer motion is divided into equal segments, because the memory of a fit is
-#: proportional to the duration. Of more than `MAX_SEGMENTS` segments, evenly distributed ones are checked.
+#: proportional to the duration: 190 MB for this duration of a PSM. Of more than `MAX_SEGMENTS` segments, evenly
+#: distributed ones are checked, since each takes seconds. At least two of four segments must agree on a warning.
 MAX_SEGMENT_DURATION, MAX_SEGMENTS = 120.0, 4
 #: Largest accepted increase of the excess beyond a joint limit if channels are exchanged or inverted [rad], [m]. A
 #: hypothesis with a larger increase is rejected. Real poses exceed the limits by up to 0.026 rad
@@ -96,9 +97,10 @@ def check_channels(observations: Observations) -> list[Finding]:
     for segment in segments_of(observations.longest):
         if segment.recording.motion(arm):
             fit = ChannelFit(segment)
-            hypotheses.append(_hypotheses(fit))
-            scales_and_offsets.append([] if _best_hypothesis(hypotheses[-1:]) else [*_scales(fit), *_offsets(fit)])
-    return _best_hypothesis(hypotheses) or _merge_segments(scales_and_offsets, arm)
+            hypotheses.append(list(_hypotheses(fit)))
+            if not _best_hypothesis(hypotheses[-1:]):
+                scales_and_offsets.append((_scales(fit), _offsets(fit)))
+    return _best_hypothesis(hypotheses) or _merge_segments(scales_and_offsets, len(hypotheses), arm)
 
 
 def segments_of(observations: Observations) -> list[Observations]:
@@ -113,13 +115,66 @@ def segments_of(observations: Observations) -> list[Observations]:
     return [Observations(recording.select(segments[k]), observations.arm) for k in chosen]
 
 
-def _hypotheses(fit: ChannelFit) -> list[Finding]:
-    """Returns the hypotheses of exchanged and inverted channels.
+def _hypotheses(fit: ChannelFit) -> Iterator[Finding]:
+    """Yields the hypotheses of exchanged and inverted channels.
 
     The `size` of each finding is its gain in log-likelihood.
     """
-    findings = [*_effort_exchanges(fit), *_full_exchanges(fit), *_inversions(fit)]
-    return [*findings, *_full_inversions(fit)] if fit.moves else findings
+    arm, used = fit.arm, [int(i) for i in fit.used]
+    unit = np.eye(arm.num_joints)
+    for i, j in combinations(sorted([*used, *map(int, fit.resting)]), 2):
+        # The efforts of two actuators at rest are constants in both orders.
+        if i in used or j in used:
+            yield _exchange(arm, (i, j), f"tau{i + 1} and tau{j + 1}", fit.gain(_exchanged(unit, i, j)))
+    for i, j in combinations(used, 2):
+        which = f"all signals (q, qd, tau) of channels {i + 1} and {j + 1}"
+        yield _exchange(arm, (i, j), which, _gain_of_channels(_exchanged(unit, i, j), fit))
+    for i in used:
+        gain = fit.gain(unit - 2 * np.diag(unit[i]))
+        what = f"tau{i + 1} or q{i + 1} has the wrong sign. The arm model fits much better with the opposite sign"
+        advice = f"Efforts must be positive in the direction of +q{i + 1}. Correct the sign and check the file again."
+        yield Finding("refusal", "effort sign", arm.joint_names[i], what, advice, (i,), gain)
+    for i in used if fit.moves else ():
+        gain = _gain_of_channels(unit - 2 * np.diag(unit[i]), fit)
+        what = (
+            f"all signals (q, qd, tau) of channel {i + 1} have the wrong sign. The arm model fits much better with "
+            "opposite signs"
+        )
+        advice = "Correct the columns of the file and check it again."
+        yield Finding("refusal", "inverted channel", arm.joint_names[i], what, advice, (i,), gain)
+
+
+def _exchanged(unit: NDArray[np.float64], i: int, j: int) -> NDArray[np.float64]:
+    """Returns the matrix (n, n) that exchanges two of n channels."""
+    order = np.arange(len(unit))
+    order[[i, j]] = j, i
+    return unit[order]
+
+
+def _exchange(arm: Arm, channels: tuple[int, ...], which: str, gain: float) -> Finding:
+    names = " and ".join(arm.joint_names[k] for k in channels)
+    what = f"{which} are exchanged. The arm model fits the recording much better if they are swapped"
+    advice = "Correct the columns of the file and check it again."
+    return Finding("refusal", "exchanged channels", names, what, advice, channels, gain)
+
+
+def _gain_of_channels(transform: NDArray[np.float64], fit: ChannelFit) -> float:
+    """Returns the gain in log-likelihood if a matrix (n, n) is applied to all signals of the channels.
+
+    It is -inf if the positions are then beyond the joint limits.
+    """
+    recording, arm = fit.recording, fit.arm
+    q, tau = recording.q @ transform.T, recording.measured_effort() @ transform.T
+    other = replace(recording, q=q, qd=None if recording.qd is None else recording.qd @ transform.T, tau=tau)
+    allowed = _limit_excess(recording, arm) + arm.per_limit(*LIMIT_MARGIN)
+    return _gain_of(other, fit) if np.all(_limit_excess(other, arm) <= allowed) else -np.inf
+
+
+def _limit_excess(recording: Recording, arm: Arm) -> NDArray[np.float64]:
+    """Returns the largest excess (l,) beyond each joint limit and coupled limit [rad, m], 0 if no row exceeds it."""
+    A, lower, upper = arm.limit_matrix()
+    values = recording.in_joint_coordinates(arm).q @ A.T
+    return np.asarray(np.max(np.maximum(np.maximum(lower - values, values - upper), 0.0), axis=0))
 
 
 def _best_hypothesis(segments: list[list[Finding]], *, at_rest: bool = False) -> list[Finding]:
@@ -147,27 +202,44 @@ def _best_hypothesis(segments: list[list[Finding]], *, at_rest: bool = False) ->
     return [replace(best, advice=f"{best.advice} Similarly likely: {alternatives}.")]
 
 
-def _merge_segments(segments: list[list[Finding]], arm: Arm) -> list[Finding]:
-    """Returns the warnings that occur in at least half of the segments, and notes on scales and offsets.
+#: Findings of one segment, and indices of the joints that its note lists.
+_WithNote = tuple[list[Finding], set[int]]
+
+
+def _merge_segments(segments: list[tuple[_WithNote, _WithNote]], count: int, arm: Arm) -> list[Finding]:
+    """Returns the warnings that occur in at least half of all segments, and notes on scales and offsets.
 
     The note on offsets lists the joints whose offset is not identifiable in any segment.
+
+    Args:
+        segments: Results of `_scales` and `_offsets` for each segment without exchanged or inverted channels.
+        count: Number of all segments.
+        arm: Arm that was recorded.
     """
     found: dict[tuple, list[Finding]] = {}
-    for finding in chain(*segments):
-        if finding.severity == "warning":
-            found.setdefault((finding.kind, finding.joints[0]), []).append(finding)
-    warnings = [group[0] for group in found.values() if 2 * len(group) >= len(segments)]
-    undetectable, uncertain = (
-        [{i for finding in segment if finding.kind == kind for i in finding.joints} for segment in segments]
-        for kind in ("undetectable offset", "uncertain effort scale")
-    )
-    uncertain_scale = set().union(*uncertain) - {joint for kind, joint in found if kind == "effort scale"}
-    undetectable_offset = set.intersection(*undetectable) if undetectable else set()
+    for finding in chain(*(warnings for segment in segments for warnings, _ in segment)):
+        found.setdefault((finding.kind, finding.joints[0]), []).append(finding)
+    uncertain = set().union(*(joints for (_, joints), _ in segments))
+    uncertain -= {joint for kind, joint in found if kind == "effort scale"}
+    undetectable = set.intersection(*(joints for _, (_, joints) in segments)) if len(segments) == count > 0 else set()
     return [
-        *warnings,
-        *_uncertain_scale(arm, sorted(uncertain_scale)),
-        *_undetectable(arm, sorted(undetectable_offset)),
+        *(group[0] for group in found.values() if 2 * len(group) >= count),
+        *_notes(arm, sorted(uncertain), sorted(undetectable)),
     ]
+
+
+def _notes(arm: Arm, uncertain: list[int], undetectable: list[int]) -> Iterator[Finding]:
+    """Yields notes on joints with an uncertain effort scale, and on joints with an undetectable position offset."""
+    names = ", ".join(arm.joint_names[i] for i in uncertain)
+    what = "the friction differs from the arm file, so an effort scale of 0.5 or 2 cannot be excluded"
+    advice = "Usual cause: friction varies from day to day. Check the torque constants if earlier recordings did not "
+    if uncertain:
+        yield Finding("note", "uncertain effort scale", names, what, f"{advice}have this note.", tuple(uncertain))
+    names, (angle, length) = ", ".join(arm.joint_names[i] for i in undetectable), OFFSET_DEVIATION
+    what = f"position offsets of {angle} rad ({length} m) cannot be detected in this recording"
+    advice = "Such offsets have the same effect as different centres of mass of the links. Check the encoder offsets."
+    if undetectable:
+        yield Finding("note", "undetectable offset", names, what, advice, tuple(undetectable))
 
 
 def _usable_poses(recording: Recording, arm: Arm) -> Recording:
@@ -181,80 +253,6 @@ def _usable_poses(recording: Recording, arm: Arm) -> Recording:
     return replace(poses, q=poses.q[usable], tau=poses.measured_effort()[usable], qd=None, t=None, lines=None)
 
 
-def _effort_exchanges(fit: ChannelFit) -> Iterator[Finding]:
-    for i, j in combinations(sorted(map(int, [*fit.used, *fit.resting])), 2):
-        if i in fit.resting and j in fit.resting:
-            continue
-        order = _exchanged(fit.arm.num_joints, i, j)
-        gain = fit.gain(fit.in_actuators(np.eye(fit.arm.num_joints)[order]))
-        yield _exchange(fit.arm, (i, j), f"tau{i + 1} and tau{j + 1}", gain)
-
-
-def _full_exchanges(fit: ChannelFit) -> Iterator[Finding]:
-    """Yields the exchanges of all signals of two channels.
-
-    The gain in log-likelihood is -inf if exchanged positions are beyond the joint limits.
-    """
-    recording, arm = fit.recording, fit.arm
-    allowed = _limit_excess(recording, arm) + arm.per_limit(*LIMIT_MARGIN)
-    for i, j in combinations(map(int, fit.used), 2):
-        order = _exchanged(arm.num_joints, i, j)
-        qd = None if recording.qd is None else recording.qd[:, order]
-        other = replace(recording, q=recording.q[:, order], qd=qd, tau=recording.measured_effort()[:, order])
-        gain = _gain_of(other, fit) if np.all(_limit_excess(other, arm) <= allowed) else -np.inf
-        yield _exchange(arm, (i, j), f"all signals (q, qd, tau) of channels {i + 1} and {j + 1}", gain)
-
-
-def _exchanged(n: int, i: int, j: int) -> NDArray[np.int_]:
-    order = np.arange(n)
-    order[[i, j]] = j, i
-    return order
-
-
-def _limit_excess(recording: Recording, arm: Arm) -> NDArray[np.float64]:
-    """Returns the largest excess (l,) beyond each joint limit and coupled limit [rad, m], 0 if no row exceeds it."""
-    A, lower, upper = arm.limit_matrix()
-    values = recording.in_joint_coordinates(arm).q @ A.T
-    return np.asarray(np.max(np.maximum(np.maximum(lower - values, values - upper), 0.0), axis=0))
-
-
-def _exchange(arm: Arm, channels: tuple[int, ...], which: str, gain: float) -> Finding:
-    names = " and ".join(arm.joint_names[k] for k in channels)
-    what = f"{which} are exchanged. The arm model fits the recording much better if they are swapped"
-    advice = "Correct the columns of the file and check it again."
-    return Finding("refusal", "exchanged channels", names, what, advice, channels, gain)
-
-
-def _inversions(fit: ChannelFit) -> Iterator[Finding]:
-    for i in map(int, fit.used):
-        name = fit.arm.joint_names[i]
-        signs = np.where(np.arange(fit.arm.num_joints) == i, -1.0, 1.0)
-        gain = fit.gain(fit.in_actuators(np.diag(signs)))
-        what = f"tau{i + 1} or q{i + 1} has the wrong sign. The arm model fits much better with the opposite sign"
-        advice = f"Efforts must be positive in the direction of +q{i + 1}. Correct the sign and check the file again."
-        yield Finding("refusal", "effort sign", name, what, advice, (i,), gain)
-
-
-def _full_inversions(fit: ChannelFit) -> Iterator[Finding]:
-    """Yields the inversions of all signals of a channel.
-
-    The gain in log-likelihood is -inf if inverted positions are beyond the joint limits.
-    """
-    recording, arm = fit.recording, fit.arm
-    allowed = _limit_excess(recording, arm) + arm.per_limit(*LIMIT_MARGIN)
-    for i in map(int, fit.used):
-        signs = np.where(np.arange(arm.num_joints) == i, -1.0, 1.0)
-        qd = None if recording.qd is None else recording.qd * signs
-        other = replace(recording, q=recording.q * signs, qd=qd, tau=recording.measured_effort() * signs)
-        gain = _gain_of(other, fit) if np.all(_limit_excess(other, arm) <= allowed) else -np.inf
-        what = (
-            f"all signals (q, qd, tau) of channel {i + 1} have the wrong sign. The arm model fits much better with "
-            "opposite signs"
-        )
-        advice = "Correct the columns of the file and check it again."
-        yield Finding("refusal", "inverted channel", arm.joint_names[i], what, advice, (i,), gain)
-
-
 def _gain_of(other: Recording, fit: ChannelFit) -> float:
     """Returns the gain in log-likelihood of a recording with exchanged, inverted or shifted channels.
 
@@ -265,13 +263,14 @@ def _gain_of(other: Recording, fit: ChannelFit) -> float:
     return ChannelFit(Observations(other, fit.arm, clocks=clocks)).log_likelihood - fit.log_likelihood
 
 
-def _scales(fit: ChannelFit) -> Iterator[Finding]:
-    """Yields warnings for actuators whose effort has a wrong scale.
+def _scales(fit: ChannelFit) -> _WithNote:
+    """Returns warnings for actuators whose effort has a wrong scale.
 
-    The scale is estimated from the dissipated friction power, or from a fit if the arm file states no friction. A note
-    lists the other actuators for which a scale of 0.5 or 2 cannot be excluded.
+    The scale is estimated from the dissipated friction power, or from a fit if the arm file states no friction. The
+    second result contains the other actuators for which a scale of 0.5 or 2 cannot be excluded.
     """
-    power, allowed, uncertain = fit.dissipation(), _friction_factors(fit), []
+    power, allowed = fit.dissipation(), _friction_factors(fit)
+    warnings, uncertain = list[Finding](), set[int]()
     for i in map(int, fit.used):
         name, ratio = fit.arm.joint_names[i], float(power[i])
         advice = f"Check the scale of tau{i + 1} (torque constant, gear ratio, unit) and the condition of the drive."
@@ -281,7 +280,7 @@ def _scales(fit: ChannelFit) -> Iterator[Finding]:
         elif ratio > 0:
             if 1 / allowed[i] < ratio < allowed[i]:
                 if not SCALES[0] * allowed[i] < ratio < SCALES[1] / allowed[i]:
-                    uncertain.append(i)
+                    uncertain.add(i)
                 continue
             what = f"the actuator friction dissipates {ratio:.2g} times the power expected from the arm file"
         else:
@@ -290,8 +289,8 @@ def _scales(fit: ChannelFit) -> Iterator[Finding]:
                 continue
             ratio = 1 / scale
             what = f"the actuator effort is about {ratio:g} times the effort expected from the arm model"
-        yield Finding("warning", "effort scale", name, what, advice, (i,), ratio)
-    yield from _uncertain_scale(fit.arm, uncertain)
+        warnings.append(Finding("warning", "effort scale", name, what, advice, (i,), ratio))
+    return warnings, uncertain
 
 
 def _scales_at_rest(fit: ChannelFit) -> Iterator[Finding]:
@@ -308,22 +307,9 @@ def _scales_at_rest(fit: ChannelFit) -> Iterator[Finding]:
 
 def _best_scale(fit: ChannelFit, channel: int) -> tuple[float, float]:
     """Returns the scale from `SCALES` with the largest gain in log-likelihood for an effort, and this gain."""
-    gains = {
-        s: fit.gain(fit.in_actuators(np.diag(np.where(np.arange(fit.arm.num_joints) == channel, s, 1.0))))
-        for s in SCALES
-    }
+    unit = np.eye(fit.arm.num_joints)
+    gains = {s: fit.gain(unit + (s - 1) * np.diag(unit[channel])) for s in SCALES}
     return max(gains.items(), key=lambda item: item[1])
-
-
-def _uncertain_scale(arm: Arm, joints: list[int]) -> Iterator[Finding]:
-    if joints:
-        what = "the friction differs from the arm file, so an effort scale of 0.5 or 2 cannot be excluded"
-        advice = (
-            "Usual cause: friction varies from day to day. Check the torque constants if earlier recordings did not "
-            "have this note."
-        )
-        names = ", ".join(arm.joint_names[i] for i in joints)
-        yield Finding("note", "uncertain effort scale", names, what, advice, tuple(joints))
 
 
 def _friction_factors(fit: ChannelFit) -> NDArray[np.float64]:
@@ -340,43 +326,29 @@ def _friction_factors(fit: ChannelFit) -> NDArray[np.float64]:
     return FRICTION_FACTOR * np.maximum(gear, 1 / gear)
 
 
-def _offsets(fit: ChannelFit) -> Iterator[Finding]:
-    """Yields a warning for the most likely position offset, and a note on offsets that are not identifiable.
+def _offsets(fit: ChannelFit) -> _WithNote:
+    """Returns a warning for the most likely position offset, and the joints whose offset is not identifiable.
 
     Offsets of joints with parallel axes have similar effects, so the warning also lists the other possible joints.
     """
-    arm, undetectable, found = fit.arm, [], {}
+    arm, undetectable, found = fit.arm, set[int](), {}
     min_offset, max_undetected = arm.per_joint(*MIN_OFFSET), arm.per_joint(*OFFSET_DEVIATION)
     for i in range(arm.num_joints):
         offset, error = fit.position_offset(i)
         if OFFSET_ERRORS * error > max_undetected[i]:
-            undetectable.append(i)
+            undetectable.add(i)
         elif abs(offset) > max(min_offset[i], OFFSET_ERRORS * error):
             found[i] = (offset, error)
-    if found:
-        first, *others = sorted(found, key=lambda i: -_gain_of(_shifted_back(fit.recording, i, found[i][0]), fit))
-        sizes = {i: f"{offset:+.2g} {'m' if arm.prismatic[i] else 'rad'}" for i, (offset, _) in found.items()}
-        unit = "m" if arm.prismatic[first] else "rad"
-        what = f"q{first + 1} has an offset of about {sizes[first]} (standard error {found[first][1]:.2g} {unit})"
-        if others:
-            what += f". Less likely: {', '.join(f'q{i + 1} has an offset of {sizes[i]}' for i in others)}"
-        advice = "Check the encoder offset."
-        yield Finding(
-            "warning", "position offset", arm.joint_names[first], what, advice, (first, *others), found[first][0]
-        )
-    yield from _undetectable(arm, undetectable)
-
-
-def _undetectable(arm: Arm, joints: list[int]) -> Iterator[Finding]:
-    if joints:
-        angle, length = OFFSET_DEVIATION
-        what = f"position offsets of {angle} rad ({length} m) cannot be detected in this recording"
-        advice = (
-            "Such offsets have the same effect as different centres of mass of the links. Check the encoder offsets."
-        )
-        names = ", ".join(arm.joint_names[i] for i in joints)
-        yield Finding("note", "undetectable offset", names, what, advice, tuple(joints))
-
-
-def _shifted_back(recording: Recording, channel: int, offset: float) -> Recording:
-    return replace(recording, q=recording.q - offset * np.eye(recording.q.shape[1])[channel])
+    if not found:
+        return [], undetectable
+    shifts = {i: offset * np.eye(arm.num_joints)[i] for i, (offset, _) in found.items()}
+    gains = {i: _gain_of(replace(fit.recording, q=fit.recording.q - shift), fit) for i, shift in shifts.items()}
+    first, *others = sorted(found, key=lambda i: -gains[i])
+    sizes = {i: f"{offset:+.2g} {'m' if arm.prismatic[i] else 'rad'}" for i, (offset, _) in found.items()}
+    unit = "m" if arm.prismatic[first] else "rad"
+    what = f"q{first + 1} has an offset of about {sizes[first]} (standard error {found[first][1]:.2g} {unit})"
+    if others:
+        what += f". Less likely: {', '.join(f'q{i + 1} has an offset of {sizes[i]}' for i in others)}"
+    joints, name = (first, *others), arm.joint_names[first]
+    warning = Finding("warning", "position offset", name, what, "Check the encoder offset.", joints, found[first][0])
+    return [warning], undetectable

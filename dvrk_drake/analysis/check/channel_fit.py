@@ -34,7 +34,8 @@ OVERSAMPLING = 2.5
 #: Largest assumed number of independent measurements of an effort in poses, see `NUM_INDEPENDENT`. It is that of the
 #: largest public recording of poses (`mtm_2015_good72`), for which the limits of the gain at rest are set.
 MAX_INDEPENDENT_POSES = 72.0
-#: Step of the numerical derivative with respect to a position [rad, m].
+#: Step of the numerical derivative with respect to a position [rad, m]. Efforts are sines and cosines of positions, so
+#: the relative error of the derivative is about half the step.
 _STEP = 1e-3
 
 
@@ -95,15 +96,11 @@ class ChannelFit:
             self._make_columns()
             self.log_likelihood, self._x, _ = self._fit(self._tau)
 
-    def in_actuators(self, transform: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns the transform (n, n) of actuator efforts that equals a transform of the recorded effort channels."""
-        if self.recording.coordinates == "actuator":
-            return transform
-        J = self.arm.transmission.matrix
-        return np.asarray(np.linalg.inv(J.T) @ transform @ J.T)
-
     def gain(self, transform: NDArray[np.float64]) -> float:
-        """Returns the gain in log-likelihood if `transform` (n, n) is applied to the recorded actuator efforts."""
+        """Returns the gain in log-likelihood if `transform` (n, n) is applied to the recorded effort channels."""
+        if self.recording.coordinates != "actuator":
+            J = self.arm.transmission.matrix
+            transform = np.linalg.inv(J.T) @ transform @ J.T
         volume = self.num_independent * float(np.log(abs(np.linalg.det(transform))))
         return self._fit(self._tau @ transform.T)[0] + volume - self.log_likelihood
 

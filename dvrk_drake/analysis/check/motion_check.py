@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.check.findings import Finding, JointSignals, RecordingReport, Severity
+from dvrk_drake.analysis.check.report import RecordingReport
 from dvrk_drake.analysis.dynamic.estimates import STRONG_CORRELATION
 from dvrk_drake.analysis.observations.effort_lag import CUT_OFF, MAX_LAG, MIN_ERRORS, EffortLag, effort_lag
+from dvrk_drake.analysis.observations.finding import Finding, Severity
 from dvrk_drake.analysis.observations.low_pass import resample
 from dvrk_drake.analysis.observations.motion_grid import GRID_RATE, MotionSignals, motion_signals
 from dvrk_drake.analysis.observations.noise import cut_offs, narrow_band, spectra
@@ -65,9 +66,8 @@ def check_motion(report: RecordingReport, observations: Observations) -> tuple[R
     t = np.asarray(actuators.t)
     duration, rate = float(t[-1] - t[0]), 1 / interval
     findings = [*_times(clock), *_gap_findings(recording)]
-    report = replace(
-        report, rate=rate, duration=duration, jitter=clock.jitter, repeated=float(np.mean(repeated_rows(actuators)))
-    )
+    repeated = float(np.mean(repeated_rows(actuators)))
+    report = replace(report, rate=rate, duration=duration, jitter=clock.jitter, repeated=repeated)
     if duration < MIN_DURATION or rate < (1 - MAX_LOST) * MIN_RATE:
         what = (
             f"the motion lasts {duration:.3g} s at {rate:.3g} Hz, so lags, signs, noise and repetition are not checked"
@@ -76,10 +76,12 @@ def check_motion(report: RecordingReport, observations: Observations) -> tuple[R
         return report, [*findings, Finding("warning", "short or slow", "t", what, advice, size=duration)]
     signals = motion_signals(actuators, clock, CUT_OFF, rate=min(rate, GRID_RATE))
     moving = np.sqrt(np.mean(signals.v**2, axis=0)) > arm.per_joint(*REST_SPEED)
-    agreement = _agreement(actuators, clock, signals)
+    agreement = None
+    if actuators.qd is not None:
+        q, qd = (resample(clock.t, x[clock.rows], signals.t) for x in (actuators.q, actuators.qd))
+        agreement = velocity_agreement(q, qd, signals.rate)
     lags = effort_lag(signals, moving)
-    names = arm.joint_names
-    work = _work(signals)
+    names, work = arm.joint_names, _work(signals)
     findings += _velocities(agreement, names) + _lags(lags, names) + _correlated_joints(signals, moving, names)
     findings += _wrong_signs(work, lags, arm)
     rows = actuators
@@ -88,22 +90,19 @@ def check_motion(report: RecordingReport, observations: Observations) -> tuple[R
     elif np.ptp(np.diff(t)) >= 1e-3 / rate:
         rows = _resampled(actuators, rate)
     period = find_period(rows.q, rate)
-    report, more = _noise(report, rows, rate, period, arm)
-    findings += more
-    acceleration = np.sqrt(np.mean(signals.vd**2, axis=0))
-    joints = tuple(
-        replace(
-            joint,
-            speed=float(np.sqrt(np.mean(signals.v[:, j] ** 2))),
-            acceleration=float(acceleration[j]),
-            velocity_gain=None if agreement is None else float(agreement.gain[j]),
-            velocity_lag=None if agreement is None else float(agreement.lag[j]),
-            effort_lag=float(lags.lag[j]) if lags.determined[j] else None,
-            work=float(work[j]),
-        )
+    statistics, more = _noise(rows, rate, period, arm)
+    speed, acceleration = (np.sqrt(np.mean(x**2, axis=0)) for x in (signals.v, signals.vd))
+    statistics |= {"speed": speed, "acceleration": acceleration, "work": work}
+    if agreement is not None:
+        statistics |= {"velocity_gain": agreement.gain, "velocity_lag": agreement.lag}
+    joints = [
+        replace(joint, **{name: float(values[j]) for name, values in statistics.items()})
         for j, joint in enumerate(report.joints)
-    )
-    return replace(report, joints=joints), findings
+    ]
+    for j in np.flatnonzero(lags.determined):
+        joints[j] = replace(joints[j], effort_lag=float(lags.lag[j]))
+    cut_off = None if period is None else arm.identification.effort_cut_off
+    return replace(report, joints=tuple(joints), period=period, floor_cut_off=cut_off), findings + more
 
 
 def repeated_row_findings(actuators: Recording) -> list[Finding]:
@@ -142,15 +141,14 @@ def repeated_row_findings(actuators: Recording) -> list[Finding]:
 
 
 def _times(clock: TrueTime) -> list[Finding]:
-    findings = []
-    if clock.reconstructed and clock.jitter > MIN_JITTER:
-        what = (
-            "time stamps disagree with the positions and velocities (intervals deviate by "
-            f"{100 * clock.jitter:.0f} %, 1 sigma)"
-        )
-        advice = "Intervals are reconstructed from q and qd. Record the controller's time stamps to avoid this."
-        findings.append(Finding("warning", "jitter", "t", what, advice, size=clock.jitter))
-    return findings
+    if not (clock.reconstructed and clock.jitter > MIN_JITTER):
+        return []
+    what = (
+        "time stamps disagree with the positions and velocities (intervals deviate by "
+        f"{100 * clock.jitter:.0f} %, 1 sigma)"
+    )
+    advice = "Intervals are reconstructed from q and qd. Record the controller's time stamps to avoid this."
+    return [Finding("warning", "jitter", "t", what, advice, size=clock.jitter)]
 
 
 def _gap_findings(recording: Recording) -> list[Finding]:
@@ -167,13 +165,6 @@ def _gap_findings(recording: Recording) -> list[Finding]:
         "signs, noise and channels are checked only in the longest segment."
     )
     return [Finding("warning", "gaps", "t", what, advice, size=gaps[row])]
-
-
-def _agreement(actuators: Recording, clock: TrueTime, signals: MotionSignals) -> VelocityAgreement | None:
-    if actuators.qd is None:
-        return None
-    q, qd = (resample(clock.t, x[clock.rows], signals.t) for x in (actuators.q, actuators.qd))
-    return velocity_agreement(q, qd, signals.rate)
 
 
 def _velocities(agreement: VelocityAgreement | None, names: tuple[str, ...]) -> list[Finding]:
@@ -264,24 +255,19 @@ def _resampled(actuators: Recording, rate: float) -> Recording:
 
 
 def _noise(
-    report: RecordingReport, rows: Recording, rate: float, period: float | None, arm: Arm
-) -> tuple[RecordingReport, list[Finding]]:
+    rows: Recording, rate: float, period: float | None, arm: Arm
+) -> tuple[dict[str, NDArray[np.float64]], list[Finding]]:
+    """Returns the cut-off frequencies and the repeatability (n,) of the actuators, and findings on noise."""
     tau = rows.measured_effort()
     tau_spectra = spectra(tau, rate, period)
     v = np.gradient(rows.q, 1 / rate, axis=0) if rows.qd is None else rows.qd
-    cuts = zip(cut_offs(tau_spectra), cut_offs(spectra(v, rate, period)), strict=True)
-    joints: list[JointSignals] = [
-        replace(joint, effort_cut_off=float(a), velocity_cut_off=float(b))
-        for joint, (a, b) in zip(report.joints, cuts, strict=True)
-    ]
+    cuts = {"effort_cut_off": cut_offs(tau_spectra), "velocity_cut_off": cut_offs(spectra(v, rate, period))}
     if period is None:
         what = "the motion does not repeat, so the repeatability of the efforts cannot be computed"
         advice = (
             "Run an excitation motion at least twice. Repeatability approximates the smallest possible model error."
         )
-        return replace(report, joints=tuple(joints)), [Finding("note", "no repetition", "motion", what, advice)]
-    floor = repeatability_floor(tau, rate, period, arm.identification.effort_cut_off)
-    joints = [replace(joint, floor=float(value)) for joint, value in zip(joints, floor, strict=True)]
+        return cuts, [Finding("note", "no repetition", "motion", what, advice)]
     what = f"the period is {period:.4f} s ({1 / period:.4f} Hz), and the recording has {len(tau) / rate / period:.1f}"
     what += " periods"
     advice = (
@@ -296,6 +282,4 @@ def _noise(
             )
             advice = "Before a fit, low-pass filter the effort with a cut-off below this band."
             findings.append(Finding("note", "narrow-band noise", name, what, advice, (j,), band.share))
-    return replace(
-        report, joints=tuple(joints), period=period, floor_cut_off=arm.identification.effort_cut_off
-    ), findings
+    return {**cuts, "floor": repeatability_floor(tau, rate, period, arm.identification.effort_cut_off)}, findings

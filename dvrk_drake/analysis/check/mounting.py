@@ -16,7 +16,7 @@ from scipy.optimize import minimize_scalar
 
 from dvrk_drake.analysis.check.channel_check import MIN_GAIN, segments_of
 from dvrk_drake.analysis.check.channel_fit import ChannelFit
-from dvrk_drake.analysis.check.findings import Finding
+from dvrk_drake.analysis.observations.finding import Finding
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.static.static_identification import MIN_POSES
 from dvrk_drake.errors import RecordingError

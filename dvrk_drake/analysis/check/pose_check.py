@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.check.findings import Finding
 from dvrk_drake.analysis.observations.effort_lag import MIN_ERRORS
+from dvrk_drake.analysis.observations.finding import Finding
 from dvrk_drake.analysis.static.excluded_measurements import find_excluded, usable_measurements
 from dvrk_drake.analysis.static.static_identification import MIN_POSES, average_repeated_poses
 from dvrk_drake.models.arm import Arm

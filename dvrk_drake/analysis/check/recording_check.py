@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.check.channel_check import MIN_GAIN, check_channels, segments_of
 from dvrk_drake.analysis.check.channel_fit import ChannelFit
-from dvrk_drake.analysis.check.findings import Finding, JointSignals, RecordingReport, Severity
 from dvrk_drake.analysis.check.motion_check import check_motion, repeated_row_findings
 from dvrk_drake.analysis.check.mounting import find_mounting, is_assumed
 from dvrk_drake.analysis.check.pose_check import check_poses
+from dvrk_drake.analysis.check.report import JointSignals, RecordingReport
 from dvrk_drake.analysis.dynamic.validation import find_other_robot, validate_motion
+from dvrk_drake.analysis.observations.finding import Finding, Severity
 from dvrk_drake.analysis.observations.motion_faults import MIN_RETURNS, TIME_UNITS
 from dvrk_drake.analysis.observations.motion_grid import MIN_DURATION
 from dvrk_drake.analysis.observations.observations import Observations
@@ -59,7 +60,8 @@ def check_recording(observations: Observations) -> RecordingReport:
     """Checks poses or a motion, without the tests of `check_channels`.
 
     Limits are checked in joint coordinates. Sensors, motors and friction are checked in actuator coordinates. Problems
-    of the recording are returned as findings. They are never raised as errors.
+    of the recording are returned as findings. They are never raised as errors. A wrong sign that contradicts the links
+    of the arm is not reported.
 
     Args:
         observations: Recording without preprocessing.
@@ -74,7 +76,7 @@ def check_recording(observations: Observations) -> RecordingReport:
     try:
         joints = recording.in_joint_coordinates(arm)
         if fault := observations.source_fault or observations.jump:
-            return replace(report, findings=(Finding("refusal", *fault), *findings))
+            return replace(report, findings=(fault, *findings))
         recording.check_fits(arm)
         tau = joints.measured_effort()
         check_effort_unit(joints, arm)
@@ -97,7 +99,8 @@ def check_recording(observations: Observations) -> RecordingReport:
         findings += more
     else:
         findings += check_poses(recording, arm)
-    return replace(report, findings=tuple(sorted(findings, key=lambda finding: _ORDER[finding.severity])))
+    report = replace(report, findings=tuple(sorted(findings, key=lambda finding: _ORDER[finding.severity])))
+    return _without_contradictions(report, observations)
 
 
 def _joint_signals(joints: Recording, arm: Arm) -> tuple[JointSignals, ...]:
@@ -255,7 +258,7 @@ def _time(observations: Observations, kind: str) -> list[Finding]:
         rows, times, _ = distinct_rows(recording)
         factor = time_factor(times, recording.q[rows], recording.qd[rows])
     if factor is None or abs(factor - 1) < TIME_TOLERANCE:
-        return [Finding("refusal", *fault)] if (fault := observations.fault) else []
+        return [fault] if (fault := observations.fault) else []
     unit = next((name for name, size in TIME_UNITS.items() if abs(factor * size - 1) < TIME_TOLERANCE), "")
     cause = f"t may be in {unit}" if unit else "usual causes: a wrong rate, or qd in another unit"
     what = f"times increase {factor:.4g} times as fast as q and qd imply ({cause})"
@@ -393,8 +396,6 @@ def require_usable(
     report_share = step_progress(progress, "checking the recording")
     report_share(0.0)
     report = check_with_channels(observations) if channels else check_recording(observations)
-    if not channels:
-        report = _without_contradictions(report, observations)
     report_share(1.0)
     kept = tuple(finding for finding in report.findings if finding.kind != ignored_kind)
     report = replace(report, findings=kept)
@@ -410,7 +411,7 @@ def check_with_channels(observations: Observations) -> RecordingReport:
 
     The channels are not checked if `check_recording` reports a refusal, unless all refusals are efforts with a wrong
     sign. Exchanged channels have a similar effect to efforts with a wrong sign. A refusal for exchanged channels
-    therefore replaces the refusals for wrong signs. A wrong sign that contradicts the links of the arm is not reported.
+    therefore replaces the refusals for wrong signs.
     """
     recording, arm = observations.recording, observations.arm
     if recording.coordinates == "wpi" and recording.q.shape[1] == arm.num_joints:
@@ -426,11 +427,9 @@ def check_with_channels(observations: Observations) -> RecordingReport:
     if any(finding.severity == "refusal" for finding in found):
         kept = [finding for finding in report.findings if finding.severity != "refusal"]
         return replace(report, findings=(*found, *kept))
-    report = _without_contradictions(report, observations)
     if report.refusals:
         return report
-    order = {"warning": 0, "note": 1}
-    return replace(report, findings=tuple(sorted((*report.findings, *found), key=lambda f: order[f.severity])))
+    return replace(report, findings=tuple(sorted((*report.findings, *found), key=lambda f: _ORDER[f.severity])))
 
 
 def _without_contradictions(report: RecordingReport, observations: Observations) -> RecordingReport:
@@ -447,7 +446,7 @@ def _without_contradictions(report: RecordingReport, observations: Observations)
         return report
     signs = np.ones(fit.arm.num_joints)
     signs[[joint for finding in wrong for joint in finding.joints]] = -1.0
-    if fit.gain(fit.in_actuators(np.diag(signs))) > -MIN_GAIN:
+    if fit.gain(np.diag(signs)) > -MIN_GAIN:
         return report
     return replace(report, findings=tuple(finding for finding in report.findings if finding not in wrong))
 

@@ -18,10 +18,12 @@ from dvrk_drake.analysis.dynamic.columns import (
 )
 from dvrk_drake.analysis.dynamic.effect_selection import cross_validate, select_effects
 from dvrk_drake.analysis.dynamic.estimates import (
-    DynamicEstimates,
     ParameterCovariance,
     ResidualSeries,
     base_parameter_estimates,
+    dry_friction,
+    link_estimates,
+    motion_parameters,
     parameter_covariance,
 )
 from dvrk_drake.analysis.dynamic.problem import ConsistentFit, DynamicProblem
@@ -159,11 +161,11 @@ def identify_dynamic(
             series.append(ResidualSeries(slice(first, first + len(segment.inner_rows)), rate, motion.period))
             first += len(segment.inner_rows)
     covariance = parameter_covariance(problem, fit, measured - predicted, settings.effort_cut_off, series)
-    estimates = DynamicEstimates(problem, fit, covariance)
+    fitted = problem, fit, covariance
     floors = [_repeatability(own.tau, motion) for own, motion in zip(observations, motions, strict=True)]
-    section = _section(problem, effects, fit, covariance, measured - held_out, floors)
-    section.links = estimates.links()
-    section.base_parameters, section.correlations = estimates.base_parameters()
+    section = _section(*fitted, measured - held_out, floors)
+    section.links = link_estimates(*fitted)
+    section.base_parameters, section.correlations = motion_parameters(*fitted)
     model = _model(recordings, arm, section, covariance.estimates)
     progress(1.0)
     nominal = float(sum(link.parameters[0] for link in problem.regressor.links))
@@ -172,7 +174,7 @@ def identify_dynamic(
         recording=recordings[0],
         num_rows=sum(map(len, recordings)),
         motions=motions,
-        dry_friction=estimates.dry_friction(),
+        dry_friction=dry_friction(*fitted),
         nominal_mass=nominal,
     )
 
@@ -256,7 +258,6 @@ def _repeatability(tau: NDArray[np.float64], motion: FittedMotion) -> NDArray[np
 
 def _section(
     problem: DynamicProblem,
-    selected: NDArray[np.int_],
     fit: ConsistentFit,
     covariance: ParameterCovariance,
     held_out: NDArray[np.float64],
@@ -269,11 +270,11 @@ def _section(
         for i, name in enumerate(arm.joint_names, start=p - arm.num_joints)
     ]
     effects = []
-    for k, effect in enumerate(problem.columns.effects[c] for c in selected):
+    for k, effect in enumerate(problem.columns.effects[c] for c in fit.effects):
         value = float(fit.x[p + k])
         if isinstance(effect, RecordingEffect):
             continue
-        if value**2 * problem.effect_precision[selected[k]] > MIN_EFFECT**2:
+        if value**2 * problem.effect_precision[fit.effects[k]] > MIN_EFFECT**2:
             effects.append(
                 DriveEffect(
                     *(effect.coordinate, effect.kind, effect.scale, value),

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.dynamic.problem import ConsistentFit, ConsistentProgram, DynamicProblem
+from dvrk_drake.analysis.estimation.estimator import StepwiseSelection
 from dvrk_drake.analysis.estimation.normal_equations import NormalEquations
-from dvrk_drake.analysis.estimation.stepwise_selection import StepwiseSelection
 from dvrk_drake.models.arm_files import has_converted_model
 
 #: Number of iterations that estimate the base tilt and the loads of the drives. Each iteration uses the parameters of

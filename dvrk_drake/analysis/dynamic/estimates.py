@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -23,7 +22,6 @@ from dvrk_drake.dynamics.dynamic_section import (
 )
 from dvrk_drake.dynamics.gravity_parameters import gravity_parameters
 from dvrk_drake.dynamics.identified_model import BaseParameterEstimate
-from dvrk_drake.dynamics.inertial_parameters import pseudo_inertia
 from dvrk_drake.dynamics.physical_consistency import reached_bounds
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effect_kinds import EFFECT_KINDS
@@ -31,47 +29,6 @@ from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 #: Largest absolute correlation of two parameters that are identifiable separately. At this value, the standard error of
 #: each is 1 / sqrt(1 - 0.95^2) = 3.2 times that with the other parameter known.
 STRONG_CORRELATION = 0.95
-
-
-@dataclass(frozen=True)
-class StrongCorrelation:
-    """Names of two parameters that are not identifiable separately, and the correlation of their estimates, -1 to 1."""
-
-    first: str
-    second: str
-    correlation: float
-
-    def __str__(self) -> str:
-        what = "difference" if self.correlation > 0 else "sum"
-        pair = f"{self.first} and {self.second}"
-        return f"{pair}: correlation {self.correlation:+.3f}, only a scaled {what} is identifiable"
-
-
-@dataclass(frozen=True, eq=False)
-class ParameterUncertainty:
-    """Standard errors and correlations of the estimates of b parameters.
-
-    Attributes:
-        names: Names of the b parameters.
-        standard_errors: Standard errors (b,) in the units of the parameters.
-        correlation: Correlations (b, b) of the estimates.
-    """
-
-    names: tuple[str, ...]
-    standard_errors: NDArray[np.float64]
-    correlation: NDArray[np.float64]
-
-    @classmethod
-    def of_covariance(cls, names: Sequence[str], covariance: NDArray[np.float64]) -> ParameterUncertainty:
-        """Constructs the uncertainty from the covariance (b, b) of the estimates."""
-        spread = np.sqrt(np.diag(covariance))
-        return cls(tuple(names), spread, covariance / np.outer(spread, spread))
-
-    def strong_correlations(self, limit: float = STRONG_CORRELATION) -> list[StrongCorrelation]:
-        """Returns the pairs whose absolute correlation exceeds `limit`, in descending order of this correlation."""
-        size = np.abs(np.triu(self.correlation, 1))
-        pairs = sorted(np.argwhere(size > limit).tolist(), key=lambda pair: -size[tuple(pair)])
-        return [StrongCorrelation(self.names[i], self.names[k], float(self.correlation[i, k])) for i, k in pairs]
 
 
 #: Largest time lag at which effort errors are assumed to be correlated [s]. If the motion repeats, errors at lags near
@@ -297,82 +254,73 @@ def _inverse(H: NDArray[np.float64]) -> NDArray[np.float64]:
 MIN_IDENTIFIABILITY = 0.5
 
 
-class DynamicEstimates:
-    """Parameter estimates of one fit."""
-
-    def __init__(self, problem: DynamicProblem, fit: ConsistentFit, covariance: ParameterCovariance) -> None:
-        """Constructs the estimates from a fit and the covariance of `fit.x`."""
-        self._problem, self._fit = problem, fit
-        self._covariance, self._prior, _ = covariance
-        self._effects = [problem.columns.effects[k] for k in fit.effects]
-
-    def links(self) -> list[LinkEstimate]:
-        """Returns the estimates of all links."""
-        estimates = []
-        for k, link in enumerate(self._problem.regressor.links):
-            rows = slice(10 * k, 10 * k + 10)
-            x, variance = self._fit.x[rows], np.diag(self._covariance)[rows]
-            estimates.append(
-                LinkEstimate(
-                    link.link,
-                    [float(v) for v in x],
-                    float(np.linalg.eigvalsh(pseudo_inertia(x))[0]),
-                    [float(v) for v in np.sqrt(variance)],
-                    _identifiability(variance[0], self._prior[10 * k, 10 * k]),
-                    reached_bounds(x, link, self._problem.boxes[link.link]),
-                )
+def link_estimates(problem: DynamicProblem, fit: ConsistentFit, covariance: ParameterCovariance) -> list[LinkEstimate]:
+    """Returns the estimates of all links, for a fit and the covariance of `fit.x`."""
+    estimates = []
+    for k, link in enumerate(problem.regressor.links):
+        rows = slice(10 * k, 10 * k + 10)
+        x, variance = fit.x[rows], np.diag(covariance.estimates)[rows]
+        estimates.append(
+            LinkEstimate(
+                link.link,
+                [float(v) for v in x],
+                [float(v) for v in np.sqrt(variance)],
+                _identifiability(variance[0], covariance.prior[10 * k, 10 * k]),
+                reached_bounds(x, link, problem.boxes[link.link]),
             )
-        return estimates
+        )
+    return estimates
 
-    def base_parameters(self) -> tuple[list[MotionParameterEstimate], list[CorrelatedEstimates]]:
-        """Returns the base parameters, and the pairs of estimates that are not identifiable separately.
 
-        A pair is two base parameters, or a base parameter and an effect. Pairs whose first parameter has an
-        identifiability below `MIN_IDENTIFIABILITY` are omitted.
-        """
-        problem, p = self._problem, self._problem.num_rigid
-        base = derive_base_parameters(problem.regressor, coupled_rotors=False)
-        B = base.combination
-        values = B @ self._fit.x[:p]
-        prior_variances = np.einsum("bp,pq,bq->b", B, self._prior[:p, :p], B)
-        # Effects with coefficient 0, which is their lower bound, are omitted.
-        shared = np.array([not isinstance(effect, RecordingEffect) for effect in self._effects], dtype=bool)
-        nonzero = p + np.flatnonzero((self._fit.x[p:] != 0) & shared)
-        to_all = np.zeros((len(B) + len(nonzero), len(self._fit.x)))
-        to_all[: len(B), :p] = B
-        to_all[len(B) + np.arange(len(nonzero)), nonzero] = 1.0
-        names = (*base.base.names, *(str(self._effects[k - p]) for k in nonzero))
-        uncertainty = ParameterUncertainty.of_covariance(names, to_all @ self._covariance @ to_all.T)
-        estimates = [
-            MotionParameterEstimate(name, unit, float(value), float(error), _identifiability(error**2, variance))
-            for name, unit, value, error, variance in zip(
-                base.base.names, base.base.units, values, uncertainty.standard_errors, prior_variances, strict=False
-            )
-        ]
-        identifiable = {estimate.name for estimate in estimates if estimate.identifiability >= MIN_IDENTIFIABILITY}
-        pairs = uncertainty.strong_correlations()
-        return estimates, [
-            CorrelatedEstimates(pair.first, pair.second, pair.correlation)
-            for pair in pairs
-            if pair.first in identifiable
-        ]
+def motion_parameters(
+    problem: DynamicProblem, fit: ConsistentFit, covariance: ParameterCovariance
+) -> tuple[list[MotionParameterEstimate], list[CorrelatedEstimates]]:
+    """Returns the base parameters of the dynamics, and the pairs of estimates that are not identifiable separately.
 
-    def dry_friction(self) -> dict[str, tuple[float, float]]:
-        """Returns coordinate -> sum of Coulomb and presliding friction, and standard error of this sum [N m, N]."""
-        p = self._problem.num_rigid
-        friction = {}
-        for name in dict.fromkeys(effect.coordinate for effect in self._effects):
-            dry = [
-                p + k
-                for k, effect in enumerate(self._effects)
-                if effect.coordinate == name
-                and EFFECT_KINDS[effect.kind].symmetric
-                and not isinstance(effect, RecordingEffect)
-            ]
-            if dry:
-                variance = float(np.sum(self._covariance[np.ix_(dry, dry)]))
-                friction[name] = float(np.sum(self._fit.x[dry])), variance**0.5
-        return friction
+    A pair is two base parameters, or a base parameter and an effect. Pairs whose first parameter has an identifiability
+    below `MIN_IDENTIFIABILITY` are omitted.
+    """
+    p = problem.num_rigid
+    base = derive_base_parameters(problem.regressor, coupled_rotors=False)
+    B = base.combination
+    prior_variances = np.einsum("bp,pq,bq->b", B, covariance.prior[:p, :p], B)
+    # Effects with coefficient 0, which is their lower bound, are omitted.
+    effects = [problem.columns.effects[k] for k in fit.effects]
+    shared = [k for k, effect in enumerate(effects) if fit.x[p + k] != 0 and not isinstance(effect, RecordingEffect)]
+    to_all = np.zeros((len(B) + len(shared), len(fit.x)))
+    to_all[: len(B), :p] = B
+    to_all[len(B) + np.arange(len(shared)), p + np.array(shared, dtype=int)] = 1.0
+    of_all = to_all @ covariance.estimates @ to_all.T
+    estimates = [
+        MotionParameterEstimate(name, unit, float(value), float(error), _identifiability(error**2, variance))
+        for name, unit, value, error, variance in zip(
+            base.base.names, base.base.units, B @ fit.x[:p], np.sqrt(np.diag(of_all)), prior_variances, strict=False
+        )
+    ]
+    identifiable = {estimate.name for estimate in estimates if estimate.identifiability >= MIN_IDENTIFIABILITY}
+    pairs = strong_correlations([*base.base.names, *(str(effects[k]) for k in shared)], of_all)
+    return estimates, [pair for pair in pairs if pair.first in identifiable]
+
+
+def strong_correlations(names: Sequence[str], covariance: NDArray[np.float64]) -> list[CorrelatedEstimates]:
+    """Returns the pairs of estimates whose absolute correlation exceeds `STRONG_CORRELATION`, the largest one first."""
+    spread = np.sqrt(np.diag(covariance))
+    correlation = np.triu(covariance / np.outer(spread, spread), 1)
+    pairs = np.argwhere(np.abs(correlation) > STRONG_CORRELATION).tolist()
+    pairs.sort(key=lambda pair: -abs(correlation[tuple(pair)]))
+    return [CorrelatedEstimates(names[i], names[k], float(correlation[i, k])) for i, k in pairs]
+
+
+def dry_friction(
+    problem: DynamicProblem, fit: ConsistentFit, covariance: ParameterCovariance
+) -> dict[str, tuple[float, float]]:
+    """Returns coordinate -> sum of Coulomb and presliding friction, and standard error of this sum [N m, N]."""
+    dry: dict[str, list[int]] = {}
+    for k, effect in enumerate((problem.columns.effects[k] for k in fit.effects), start=problem.num_rigid):
+        if EFFECT_KINDS[effect.kind].symmetric and not isinstance(effect, RecordingEffect):
+            dry.setdefault(effect.coordinate, []).append(k)
+    variances = {name: float(np.sum(covariance.estimates[np.ix_(own, own)])) for name, own in dry.items()}
+    return {name: (float(np.sum(fit.x[own])), variances[name] ** 0.5) for name, own in dry.items()}
 
 
 def _identifiability(variance: float, prior_variance: float) -> float:
@@ -395,6 +343,6 @@ def base_parameter_estimates(
     values = B @ phi
     errors = np.sqrt(np.diag(B @ covariance[: len(phi), : len(phi)] @ B.T))
     return [
-        BaseParameterEstimate.of(name, value, error, section.degrees_of_freedom)
+        BaseParameterEstimate(name, float(value), float(error), section.degrees_of_freedom)
         for name, value, error in zip(gravity.base.names, values, errors, strict=True)
     ]

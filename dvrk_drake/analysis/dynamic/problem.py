@@ -10,10 +10,9 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.dynamic.columns import DynamicColumns, RecordingEffect
-from dvrk_drake.analysis.estimation.estimator import ASSUMED_ERROR, Prior
+from dvrk_drake.analysis.estimation.estimator import ASSUMED_ERROR, Prior, StepwiseSelection
 from dvrk_drake.analysis.estimation.normal_equations import NormalEquations, OwnColumns, fold_sums
 from dvrk_drake.analysis.estimation.priors import KNOWN_SHARE, TILT_DEVIATION, rigid_deviations
-from dvrk_drake.analysis.estimation.stepwise_selection import StepwiseSelection
 from dvrk_drake.analysis.observations.motion_grid import MotionGrid
 from dvrk_drake.dynamics.dynamic_model import is_loaded, transmitted_effort
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor

@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.check.findings import Finding
 from dvrk_drake.analysis.dynamic.columns import DIRECTION_WIDTH
+from dvrk_drake.analysis.estimation.robust_fit import rms
+from dvrk_drake.analysis.observations.finding import Finding
 from dvrk_drake.analysis.observations.motion_grid import MotionGrid
 from dvrk_drake.analysis.observations.noise import MOTION_FREQUENCY
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.observations.repetition import motion_floor
-from dvrk_drake.analysis.results import Validation
-from dvrk_drake.analysis.verdict import Tolerance, coverage, judge, rule_text, tolerances
-from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
+from dvrk_drake.analysis.results import JudgedError, Validation
+from dvrk_drake.analysis.verdict import coverage, judge, rule_text, tolerances
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.recordings.recording import GAP, MIN_GAP
 
-#: Number of frequencies of the sine and cosine functions in the position-dependent error.
+#: Number of frequencies of the sine and cosine functions in the position-dependent error: those of the cable effects in
+#: an arm file (`CABLES`).
 _HARMONICS = 2
 #: Smallest ratio of an error to the one expected on another day that is reported. It is exceeded in 12 of 12 pairs of
 #: recordings of two PSMs, and in 2 of 8 pairs of one PSM (benchmarks/three_joint_recordings.py).
@@ -64,35 +66,34 @@ SHARE_LABELS = (
 )
 
 
-@dataclass(frozen=True)
-class ActuatorError:
+@dataclass(frozen=True, kw_only=True)
+class ActuatorError(JudgedError):
     """RMS effort error of one actuator over a motion, after low-pass filtering.
 
     Attributes:
-        name: Name of the joint of the actuator.
         rms_effort: RMS measured effort [N m, N if prismatic].
         rms_error: RMS of measured minus predicted effort [N m, N if prismatic].
         relative_error: rms_error / rms_effort [1], None if rms_effort is 0.
         shares: Shares of rms_error^2 by cause.
         repeatability: Relative RMS difference of the efforts between periods (see `repeatability_floor`) [1], or None
             if the motion does not repeat.
-        verdict: Verdict on the actuator, see `judge`.
-        coverage: Share of the range between the limits that the motion covers, see `verdict.coverage` [1].
         inside: Share of the efforts inside the 95 % prediction interval (`DynamicModel.half_width`) [1], or None if the
             model has no interval.
         inside_other_day: The same for the interval on another day (`DynamicModel.combined_half_width`) [1].
     """
 
-    name: str
     rms_effort: float
     rms_error: float
     relative_error: float | None
     shares: ErrorShares
     repeatability: float | None
-    verdict: Verdict
-    coverage: float
     inside: float | None = None
     inside_other_day: float | None = None
+
+    @property
+    def judged_error(self) -> float | None:
+        """Relative error for the verdict."""
+        return self.relative_error
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
@@ -130,14 +131,9 @@ class DynamicValidation(Validation):
         return float(np.mean(errors)) if errors else float("nan")
 
     @property
-    def verdicts(self) -> dict[str, Verdict]:
-        """Verdict on each actuator."""
-        return {actuator.name: actuator.verdict for actuator in self.actuators}
-
-    @property
-    def relative_errors(self) -> dict[str, float | None]:
-        """RMS error / RMS effort of each actuator after low-pass filtering [1], None if its measured effort is 0."""
-        return {actuator.name: actuator.relative_error for actuator in self.actuators}
+    def errors(self) -> list[ActuatorError]:
+        """Errors of the actuators after low-pass filtering."""
+        return self.actuators
 
     def as_dict(self) -> dict:
         """Returns the output of `validate --json` as a dictionary."""
@@ -192,15 +188,28 @@ def validate_motion(model: IdentifiedModel, observations: Observations) -> Dynam
     vd = grid.efforts_at_rows(arm.transmission.velocity(grid.vd))[grid.inner]
     covered = coverage(arm, np.ptp(grid.q, axis=0), "actuator")
     widths = np.array([dynamics.combined_half_width(grid.channels, other_day=day) for day in (False, True)])
-    actuators = []
+    errors, actuators = measured - predicted, []
     for i, (name, tolerance) in enumerate(zip(arm.joint_names, tolerances(arm, "actuator"), strict=True)):
-        shares = error_shares(measured[:, i] - predicted[:, i], i, a, v[:, i], vd, t, period)
-        judged = tolerance, float(covered[i]), model.joints[i].feedforward_scale > 0
-        error = _actuator_error(name, measured[:, i], predicted[:, i], shares, floor[i], *judged)
-        if np.any(measured[:, i]) and np.all(widths[:, i]):
-            within = np.mean(np.abs(measured[:, i] - predicted[:, i])[:, None] <= widths[:, i], axis=0).tolist()
-            error = replace(error, inside=within[0], inside_other_day=within[1])
-        actuators.append(error)
+        error, coverage_of_range = errors[:, i], float(covered[i])
+        effort, size = rms(measured[:, i]), rms(error)
+        commanded = model.joints[i].feedforward_scale > 0
+        inside: list[float | None] = [None, None]
+        if effort > 0 and np.all(widths[:, i]):
+            inside = np.mean(np.abs(error)[:, None] <= widths[:, i], axis=0).tolist()
+        actuators.append(
+            ActuatorError(
+                name=name,
+                rms_effort=effort,
+                rms_error=size,
+                relative_error=size / effort if effort > 0 else None,
+                shares=error_shares(error, i, a, v[:, i], vd, t, period),
+                repeatability=floor[i],
+                verdict=judge(effort, size, tolerance, coverage_of_range, commanded=commanded),
+                coverage=coverage_of_range,
+                inside=inside[0],
+                inside_other_day=inside[1],
+            )
+        )
     return DynamicValidation(
         model=model,
         recording=observations.recording,
@@ -243,23 +252,6 @@ def filtered_efforts(model: IdentifiedModel, grid: MotionGrid) -> NDArray[np.flo
 def _efforts(model: IdentifiedModel, grid: MotionGrid) -> NDArray[np.float64]:
     dynamics = model.dynamic_model
     return grid.efforts_at_rows(np.concatenate([dynamics.effort(g.q, g.v, g.vd) for g, _, _ in grid.each_segment()]))
-
-
-def _actuator_error(
-    name: str,
-    measured: NDArray[np.float64],
-    predicted: NDArray[np.float64],
-    shares: ErrorShares,
-    repeatability: float | None,
-    tolerance: Tolerance,
-    covered: float,
-    commanded: bool,
-) -> ActuatorError:
-    error = measured - predicted
-    effort, size = float(np.sqrt(np.mean(measured**2))), float(np.sqrt(np.mean(error**2)))
-    relative = size / effort if effort > 0 else None
-    verdict = judge(effort, size, tolerance, covered, commanded=commanded)
-    return ActuatorError(name, effort, size, relative, shares, repeatability, verdict, covered)
 
 
 def error_shares(

@@ -22,7 +22,7 @@ UNSTATED_ROTOR_SHARE = 0.22
 #: inertia, if the model states no rotors. The drives of published robots (UR, Franka, Staubli) reach 10 to 100 rad/s^2.
 ROTOR_ACCELERATION = 100.0, 30.0
 #: Factor of the prior standard deviation of the first moments, for rotors that the SDF models as links. The factor is
-#: small because rotors are balanced.
+#: small because rotors are balanced. Zero would have no reciprocal.
 _BALANCE = 1e-6
 #: Prior standard deviation of the direction of gravity [rad]. It is the accuracy with which a base is levelled.
 TILT_DEVIATION = 0.05

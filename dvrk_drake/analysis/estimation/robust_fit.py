@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 #: Residuals above the first number of robust standard deviations get a smaller weight (Huber). Residuals above the
-#: second number get a weight of zero.
+#: second number get a weight of zero. Of normal errors, 0.3 % exceed the first number, which costs 0.04 % of the
+#: information, and 2e-9 exceed the second one.
 HUBER_LIMIT, REJECTION_LIMIT = 3.0, 6.0
 #: Largest degrees of freedom. Student's t distribution with more is the normal distribution within 1e-6.
 MAX_FREEDOM = 1e6

@@ -36,14 +36,15 @@ INFORMATION_TIMES = 8
 _DERIVATIVE_TIMES = (6, 6, 8, 12)
 #: Share of the effort limits that the optimisation uses, see `USED`.
 _USED_EFFORT = 0.95
-#: Longest default period [s].
+#: Longest default period [s]. A motion of two minutes then has four periods, which give its repeatability.
 MAX_PERIOD = 30.0
 #: Largest number of major iterations of the solver, and of minor iterations in each of them. The first quadratic
 #: programs need more minor iterations, but incomplete solutions of them are sufficient: the same expected error is
 #: reached in 70 % of the time (MTML, 30 s, 16 harmonics).
 MAX_ITERATIONS, MAX_MINOR_ITERATIONS = 100, 150
 #: Factor by which a motion is contracted towards its centre until it has no collision and meets all limits, and largest
-#: number of contractions.
+#: number of contractions. The contraction is at most 1 % more than necessary, and ends at 22 % of the motion, with
+#: which an excitation is no longer useful.
 _CONTRACTION, _MAX_CONTRACTIONS = 0.99, 150
 
 

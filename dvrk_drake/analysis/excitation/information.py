@@ -27,6 +27,7 @@ NUM_MOTIONS, MOTION_PERIOD, MOTION_HARMONICS, STATES_PER_MOTION = 20, 10.0, 6, 5
 #: Acceleration below which presliding is smoothed, as a share of the RMS acceleration of the random motions.
 SMOOTHED_ACCELERATION = 0.2
 #: Step of the forward differences with respect to positions, velocities and accelerations, relative to their limits.
+#: Near the square root of the machine precision, the truncation and the rounding error of a difference are similar.
 STEP = 1e-7
 
 

@@ -15,7 +15,8 @@ from dvrk_drake.recordings.periodic_motion import FourierBasis, PeriodicMotion
 #: Number of times per harmonic at which the limits are imposed. Between the times, the highest harmonic grows by at
 #: most 2.5 % of its amplitude.
 LIMIT_TIMES = 14
-#: Share of the limits that random and optimised motions use. Between the times, a motion may exceed a limit slightly.
+#: Share of the limits that random and optimised motions use. Between the times, a motion may exceed a limit slightly:
+#: the highest harmonic, by 2.5 % of its amplitude, is a part of the motion.
 USED = 0.98
 
 

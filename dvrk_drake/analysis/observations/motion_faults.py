@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
+from dvrk_drake.analysis.observations.finding import Finding
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.csv_rows import listed
 from dvrk_drake.recordings.recording import (
@@ -49,23 +48,7 @@ TIME_UNITS = {
 MAX_SPEED, MAX_RATE = (10.0, 1.0), 10_000.0
 
 
-class MotionFault(NamedTuple):
-    """Fault of a motion.
-
-    Attributes:
-        kind: Short name of the fault.
-        where: Affected column.
-        what: Description without a final period.
-        advice: Sentences with the cause and the recommended action.
-    """
-
-    kind: str
-    where: str
-    what: str
-    advice: str
-
-
-def source_fault(recording: Recording, arm: Arm) -> MotionFault | None:
+def source_fault(recording: Recording, arm: Arm) -> Finding | None:
     """Returns a fault of a motion whose rows have two sources or whose angles are wrapped, or None.
 
     Raises:
@@ -75,7 +58,7 @@ def source_fault(recording: Recording, arm: Arm) -> MotionFault | None:
     return _two_sources(recording, arm) or _wrapped_angle(recording, joints, arm)
 
 
-def _two_sources(recording: Recording, arm: Arm) -> MotionFault | None:
+def _two_sources(recording: Recording, arm: Arm) -> Finding | None:
     """Returns a fault if rows of two sources alternate, so that most channels of a signal jump and return."""
     if not recording.is_motion:
         return None
@@ -94,7 +77,7 @@ def _two_sources(recording: Recording, arm: Arm) -> MotionFault | None:
                 "Usual cause: two publishers on one topic. List them with ros2 topic info -v TOPIC, stop one of them, "
                 "and record again."
             )
-            return MotionFault("two sources", name, what, advice)
+            return Finding("refusal", "two sources", name, what, advice)
     return None
 
 
@@ -108,7 +91,7 @@ def _returns(x: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.asarray(2 * np.sum(returns, axis=1) > max(int(np.sum(changes)), 1))
 
 
-def _wrapped_angle(recording: Recording, joints: Recording, arm: Arm) -> MotionFault | None:
+def _wrapped_angle(recording: Recording, joints: Recording, arm: Arm) -> Finding | None:
     """Returns a fault if an angle jumps by a multiple of 2 pi between two rows of a motion."""
     if not (recording.is_motion and recording.has_increasing_times):
         return None
@@ -125,11 +108,11 @@ def _wrapped_angle(recording: Recording, joints: Recording, arm: Arm) -> MotionF
             count = f"{len(rows)} row{'s' * (len(rows) != 1)}"
             what = f"{where} jumps by a multiple of 2 pi in {count}, first at {recording.where(int(rows[0]))}"
             advice = "The angle is wrapped. Make it continuous (numpy.unwrap) and within the limits of the joint."
-            return MotionFault("wrapped angle", arm.joint_names[joint], what, advice)
+            return Finding("refusal", "wrapped angle", arm.joint_names[joint], what, advice)
     return None
 
 
-def jump_fault(recording: Recording, arm: Arm) -> MotionFault | None:
+def jump_fault(recording: Recording, arm: Arm) -> Finding | None:
     """Returns a fault if positions jump between two rows of a motion, or None.
 
     A jump exceeds `SAME_POSE`, `MIN_JUMP` of the range of the joint, and `JUMP_RATIO` times the largest other step
@@ -167,10 +150,10 @@ def jump_fault(recording: Recording, arm: Arm) -> MotionFault | None:
         "Usual causes: recordings joined into one file, wrong rows, or lost encoder counts. Remove wrong rows. Write "
         "joined recordings to one file each; identify accepts several files."
     )
-    return MotionFault("jump", "q", what, advice)
+    return Finding("refusal", "jump", "q", what, advice)
 
 
-def time_fault(recording: Recording, arm: Arm) -> MotionFault | None:
+def time_fault(recording: Recording, arm: Arm) -> Finding | None:
     """Returns a fault of the times of rows that are a motion.
 
     The times are implausible if the joints would move faster than `MAX_SPEED`, or if rows in small steps are too slow
@@ -203,14 +186,13 @@ def time_fault(recording: Recording, arm: Arm) -> MotionFault | None:
                 what = f"t implies an RMS speed of {speeds[joint]:.3g} {unit_of_speed} of joint {joint + 1}"
             what += f" (t may be in {unit}: {rate / TIME_UNITS[unit]:.4g} Hz)" if unit else ""
             advice = f"Use t in s. {recording.rest_advice}"
-            return MotionFault("wrong time", "t", what, advice if unit else "Use t in s, and q in rad (m).")
+            return Finding("refusal", "wrong time", "t", what, advice if unit else "Use t in s, and q in rad (m).")
     if not moves or recording.is_motion:
         return None
     if is_motion:
         what = f"the recording has {len(recording)} rows of a motion ({moves}); required: {MIN_ROWS} rows"
         advice = "Static identification requires poses at rest. A dynamic model requires a longer motion."
-        return MotionFault("too few rows", "rows", what, advice)
+        return Finding("refusal", "too few rows", "rows", what, advice)
     what = f"the rows are a motion ({moves}), but the rate of {rate:.3g} Hz is too slow"
-    return MotionFault(
-        "too slow", "t", what, f"Record a motion at {MIN_RATE:g} Hz or more, or poses at rest. {recording.rest_advice}"
-    )
+    advice = f"Record a motion at {MIN_RATE:g} Hz or more, or poses at rest. {recording.rest_advice}"
+    return Finding("refusal", "too slow", "t", what, advice)

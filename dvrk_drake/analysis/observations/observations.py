@@ -9,8 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from dvrk_drake.analysis.observations.finding import Finding
 from dvrk_drake.analysis.observations.low_pass import central_difference, low_pass, resample
-from dvrk_drake.analysis.observations.motion_faults import MotionFault, jump_fault, source_fault, time_fault
+from dvrk_drake.analysis.observations.motion_faults import jump_fault, source_fault, time_fault
 from dvrk_drake.analysis.observations.motion_grid import GRID_RATE, MIN_DURATION, MotionGrid, even_times
 from dvrk_drake.analysis.observations.repetition import find_period
 from dvrk_drake.analysis.observations.static_segments import static_poses
@@ -71,7 +72,7 @@ class Observations:
         return self.recording.in_actuator_coordinates(self.arm).measured_effort()
 
     @cached_property
-    def fault(self) -> MotionFault | None:
+    def fault(self) -> Finding | None:
         """Fault of the sources or the times of the rows, see `source_fault` and `time_fault`.
 
         Raises:
@@ -79,17 +80,21 @@ class Observations:
         """
         if (fault := self.source_fault) is not None:
             return fault
-        self.recording.check_fits(self.arm)
-        self._check_times()
-        return time_fault(self.recording, self.arm)
+        recording = self.recording
+        recording.check_fits(self.arm)
+        # With decreasing times, a motion would be treated as poses.
+        has_times = recording.t is not None and len(recording) >= MIN_ROWS
+        if has_times and (recording.is_motion or recording.motion(self.arm)):
+            increasing_times(recording)
+        return time_fault(recording, self.arm)
 
     @cached_property
-    def source_fault(self) -> MotionFault | None:
+    def source_fault(self) -> Finding | None:
         """Fault of the sources of the rows, see `motion_faults.source_fault`."""
         return source_fault(self.recording, self.arm)
 
     @cached_property
-    def jump(self) -> MotionFault | None:
+    def jump(self) -> Finding | None:
         """Jump of the positions. None if there is no jump or if static poses are used: between them, the arm may move.
 
         Raises:
@@ -121,18 +126,6 @@ class Observations:
             note = f"Static poses found in the motion: {len(poses)}, in {len(self.recording)} rows."
             return Poses(Observations(poses, self.arm, self.settings), note)
         return Poses(self, "", moves=poses is not None and bool(self.recording.motion(self.arm)))
-
-    def _check_times(self) -> None:
-        """Rejects a motion whose times do not increase. Without this check, it would be treated as poses."""
-        recording, t = self.recording, self.recording.t
-        if t is None or len(t) < MIN_ROWS or recording.has_increasing_times:
-            return
-        if recording.is_motion or recording.motion(self.arm):
-            row = int(np.flatnonzero(np.diff(t) <= 0)[0]) + 1
-            raise RecordingError(
-                f"{recording.where(row)}: time t does not increase. Sort the rows by time, and use the times of one "
-                "clock [s]."
-            )
 
     @cached_property
     def segments(self) -> list[slice]:

@@ -68,9 +68,11 @@ class Whitening:
         return y
 
 
-#: Largest time shift between two motions that do not repeat [s].
+#: Largest time shift between two motions that do not repeat [s]. A recorder that is started by hand is early or late by
+#: less than this time.
 MAX_SHIFT = 5.0
-#: Smallest duration of the motion that both recordings must contain [s].
+#: Smallest duration of the motion that both recordings must contain [s]. At the cut-off frequency `CUT_OFF`, it has 50
+#: independent values of each effort.
 MIN_OVERLAP = 5.0
 #: Largest cut-off frequency of the low-pass filter of the difference [Hz]. Efforts of a payload have the frequencies of
 #: the motion, which are below this value.
@@ -86,7 +88,8 @@ NUM_SEGMENTS = 8
 CORRELATION_LENGTH = 0.25
 #: Number of columns of `changes` without prior: offset, dry friction and viscous friction.
 _NUM_WITHOUT_PRIOR = 3
-#: Step of the search for the time shift before refinement [s].
+#: Step of the search for the time shift before refinement [s]. The difference of the positions has a single minimum
+#: within a period of their highest frequencies, which is many times longer.
 _STEP = 0.01
 
 

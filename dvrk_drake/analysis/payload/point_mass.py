@@ -8,12 +8,14 @@ fixed point.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from dvrk_drake.analysis.estimation.normal_equations import NormalEquations
+from dvrk_drake.dynamics.inertial_parameters import PARAMETER_NAMES
 
 #: Largest standard error of an identifiable coordinate, as a share of the largest distance. A larger error
 #: does not determine the side of the link on which the payload is.
@@ -22,8 +24,11 @@ MAX_STANDARD_ERROR = 0.5
 #: of mass is also an initial position.
 _INITIAL_DISTANCES = (0.15, 0.4)
 #: Number of inertial parameters of a rigid body.
-_RIGID = 10
+_RIGID = len(PARAMETER_NAMES)
+#: Relative size of the eigenvalues of a matrix with a unit diagonal that are rounding errors. The matrices are sums
+#: over at most `MAX_ROWS` rows, whose relative rounding errors are below 1e-12.
 _NEGLIGIBLE = 1e-11
+#: Replaces 0 as a divisor. All sums of squared efforts are many orders of magnitude larger.
 _TINY = 1e-30
 
 
@@ -60,6 +65,7 @@ def point_mass_parameters(mass: float, position: NDArray[np.float64]) -> NDArray
     return mass * np.array([1.0, x, y, z, *moments, -x * y, -x * z, -y * z])
 
 
+@dataclass(frozen=True, eq=False)
 class PointMassProblem:
     """Regression tau_i = Y_i phi(m, p) + N_i x_i for every actuator i.
 
@@ -69,35 +75,27 @@ class PointMassProblem:
 
     Attributes:
         equations: Normal equations. The ten columns of the link come first, then the nuisance parameters.
+        independent: Number of independent measurements of each effort.
         com: Centre of mass (3,) of the link in the link frame [m].
+        precision: Reciprocal prior variances (n, k) of the nuisance parameters, 0 if there is no prior.
         max_mass: Largest mass of the point mass [kg].
         max_distance: Largest distance of the point mass from `com` along each axis [m].
     """
 
-    def __init__(
-        self,
-        equations: NormalEquations,
-        independent: float,
-        com: NDArray[np.float64],
-        precision: NDArray[np.float64],
-        rows: int,
-        max_mass: float,
-        max_distance: float,
-    ) -> None:
-        """Constructs the problem.
+    equations: NormalEquations
+    independent: float
+    com: NDArray[np.float64]
+    precision: NDArray[np.float64]
+    max_mass: float
+    max_distance: float
 
-        Args:
-            equations: Normal equations. The ten columns of the link come first, then the nuisance parameters.
-            independent: Ratio of the number of independent measurements to the number of rows.
-            com: Centre of mass (3,) of the link in the link frame [m].
-            precision: Reciprocal prior variances (n, k) of the nuisance parameters, 0 if there is no prior.
-            rows: Number of rows.
-            max_mass: Largest mass of the point mass [kg].
-            max_distance: Largest distance of the point mass from `com` along each axis [m].
-        """
-        self.equations, self.com, self.max_mass, self.max_distance = equations, com, max_mass, max_distance
-        self._total = equations.total.dense()
-        self._count, self._precision = rows * independent, precision
+    @cached_property
+    def _total(self) -> NDArray[np.float64]:
+        return self.equations.total.dense()
+
+    def _without(self, fold: int) -> NDArray[np.float64]:
+        """Returns the products of all rows except those of one fold."""
+        return self._total - self.equations.of_fold(fold).dense()
 
     def fit(self, start: PointMass | None = None) -> tuple[PointMass, NDArray[np.float64], NDArray[np.float64]]:
         """Fits the point mass.
@@ -113,14 +111,14 @@ class PointMassProblem:
             Point mass, weights (n,) of the actuators, and standard errors (4,) of mass and position, assuming
             independent noise.
         """
-        weights = self._count / np.maximum(self._total[:, -1, -1], _TINY)
+        weights = self.independent / np.maximum(self._total[:, -1, -1], _TINY)
         determined = np.ones(3, dtype=bool) if start is None else start.determined
         while True:
             body = start or self._search(self._reduced(self._total, weights), weights, determined)
             for _ in range(10):
                 reduced = self._reduced(self._total, weights)
                 body = self._refine(reduced, weights, body)
-                weights = self._count / np.maximum(_squared_residuals(reduced, body), _TINY)
+                weights = self.independent / np.maximum(_squared_residuals(reduced, body), _TINY)
             errors = self._standard_errors(self._reduced(self._total, weights), weights, body)
             # A coordinate at the boundary of the search region is not identifiable.
             at_boundary = np.abs(body.position - self.com) > (1 - 1e-6) * self.max_distance
@@ -132,8 +130,7 @@ class PointMassProblem:
 
     def without_fold(self, fold: int, weights: NDArray[np.float64], start: PointMass) -> PointMass:
         """Returns the point mass fitted without one fold, for the weights (n,) and the initial value `start`."""
-        others = self._total - self.equations.of_fold(fold).dense()
-        return self._refine(self._reduced(others, weights), weights, start)
+        return self._refine(self._reduced(self._without(fold), weights), weights, start)
 
     def mass_at_com(self, weights: NDArray[np.float64], fold: int | None = None) -> tuple[float, float]:
         """Returns the estimated mass of a payload at the link's centre of mass and the standard error [kg].
@@ -144,15 +141,15 @@ class PointMassProblem:
             weights: Weights (n,) of the actuators.
             fold: Fold to exclude, or None.
         """
-        products = self._total if fold is None else self._total - self.equations.of_fold(fold).dense()
+        products = self._total if fold is None else self._without(fold)
         H, b = _weighted(self._reduced(products, weights), weights)
         unit = point_mass_parameters(1.0, self.com)
         information = max(float(unit @ H @ unit), _TINY)
         return float(unit @ b) / information, information**-0.5
 
-    def nuisances(self, body: PointMass, weights: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns the nuisance parameters (n, k) that are fitted together with a given point mass."""
-        return np.array([self._own_nuisances(i, self._total[i], body.parameters, weights) for i in range(len(weights))])
+    def coefficients(self, body: PointMass, weights: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Returns the coefficients (n, 10 + k) of all columns for a given point mass, with fitted nuisances."""
+        return self._coefficients(self._total, body.parameters, weights)
 
     def fold_errors(self, fold: int, weights: NDArray[np.float64], start: PointMass | None) -> NDArray[np.float64]:
         """Returns the sums of squared prediction errors (n,) of one held-out fold.
@@ -185,18 +182,20 @@ class PointMassProblem:
 
         The nuisance parameters are fitted to the training rows.
         """
-        squares = np.empty(len(training))
-        for i, (H, products) in enumerate(zip(training, held_out, strict=True)):
-            residual = np.concatenate([-phi, -self._own_nuisances(i, H, phi, weights), [1.0]])
-            squares[i] = max(residual @ products @ residual, 0.0)
-        return squares
+        residual = np.hstack([-self._coefficients(training, phi, weights), np.ones((len(training), 1))])
+        return np.maximum(np.einsum("na,nab,nb->n", residual, held_out, residual), 0.0)
 
-    def _own_nuisances(
-        self, i: int, H: NDArray[np.float64], phi: NDArray[np.float64], weights: NDArray[np.float64]
+    def _coefficients(
+        self, products: NDArray[np.float64], phi: NDArray[np.float64], weights: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Returns the nuisance parameters (k,) of actuator i for phi (10,), computed from the sums of products H."""
-        right = H[_RIGID:-1, -1] - H[_RIGID:-1, :_RIGID] @ phi
-        return _pseudo_solve(H[_RIGID:-1, _RIGID:-1] + np.diag(self._precision[i] / weights[i]), right)
+        """Returns phi (10,) and the nuisance parameters (k,) that are fitted to the products, for each actuator."""
+        nuisances = [
+            _pseudo_solve(
+                H[_RIGID:-1, _RIGID:-1] + np.diag(precision / weight), H[_RIGID:-1, -1] - H[_RIGID:-1, :_RIGID] @ phi
+            )
+            for H, precision, weight in zip(products, self.precision, weights, strict=True)
+        ]
+        return np.hstack([np.tile(phi, (len(products), 1)), nuisances])
 
     def _reduced(self, products: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns the products (n, 11, 11) of the link's columns and the effort.
@@ -206,7 +205,7 @@ class PointMassProblem:
         keep = np.append(np.arange(_RIGID), products.shape[-1] - 1)
         reduced = np.empty((len(products), _RIGID + 1, _RIGID + 1))
         for i, full in enumerate(products):
-            H = full[_RIGID:-1, _RIGID:-1] + np.diag(self._precision[i] / weights[i])
+            H = full[_RIGID:-1, _RIGID:-1] + np.diag(self.precision[i] / weights[i])
             coupling = full[_RIGID:-1, keep]
             reduced[i] = full[np.ix_(keep, keep)] - coupling.T @ _pseudo_solve(H, coupling)
         return reduced
@@ -236,24 +235,19 @@ class PointMassProblem:
         free = np.concatenate([[True], start.determined])
         lower = np.concatenate([[0.0], self.com - self.max_distance])[free]
         upper = np.concatenate([[self.max_mass], self.com + self.max_distance])[free]
-        full = np.concatenate([[start.mass], start.position])
-
-        def all_values(x: NDArray[np.float64]) -> NDArray[np.float64]:
-            values = full.copy()
-            values[free] = x
-            return values
+        values = np.concatenate([[start.mass], start.position])
 
         def residual(x: NDArray[np.float64]) -> NDArray[np.float64]:
-            values = all_values(x)
+            values[free] = x
             return A @ point_mass_parameters(values[0], values[1:]) - b
 
         def jacobian(x: NDArray[np.float64]) -> NDArray[np.float64]:
-            values = all_values(x)
+            values[free] = x
             return (A @ _derivatives(values[0], values[1:]))[:, free]
 
-        start_x = np.clip(full[free], lower + 1e-9, upper - 1e-9)
+        start_x = np.clip(values[free], lower + 1e-9, upper - 1e-9)
         result = least_squares(residual, start_x, jac=jacobian, bounds=(lower, upper), x_scale=0.1)
-        values = all_values(result.x)
+        values[free] = result.x
         return PointMass(float(values[0]), values[1:], start.determined)
 
     def _standard_errors(

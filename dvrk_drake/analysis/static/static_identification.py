@@ -10,7 +10,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.estimation.robust_fit import LinearFit, blocks, rms, weighted_fit
+from dvrk_drake.analysis.estimation.robust_fit import blocks, rms, weighted_fit
 from dvrk_drake.analysis.results import Identification
 from dvrk_drake.analysis.static.effect_selection import StaticProblem, select_effects
 from dvrk_drake.analysis.static.excluded_measurements import (
@@ -35,7 +35,8 @@ from dvrk_drake.recordings.recording import REST_SPEED, SAME_POSE, Recording
 
 Method = Literal["robust", "paper"]
 
-#: Smallest number of distinct poses for an identification.
+#: Smallest number of distinct poses for an identification. The efforts of seven joints are then more than three times
+#: as many as the 12 to 15 base parameters of an MTM or a PSM.
 MIN_POSES = 8
 #: Condition for the feedforward of a joint with a small torque. The torque is small if its RMS value, as a share of the
 #: effort limit, is below the first number. The ratio of the leave-one-out error to the RMS torque must then not exceed
@@ -134,11 +135,13 @@ def identify_static(
         usable = usable & ~robust.outliers
         feedforward_scale = _feedforward_scales(problem, fit.leave_one_out_residuals, usable)
         validated = _cross_validate(problem, progress)
-    fit = _scaled(fit, tau, feedforward_scale)
+    residuals, leave_one_out = (
+        tau - feedforward_scale * (tau - errors) for errors in (fit.residuals, fit.leave_one_out_residuals)
+    )
     model = IdentifiedModel(
         arm=arm,
         base_parameters=[
-            BaseParameterEstimate.of(name, value, error, float(own))
+            BaseParameterEstimate(name, float(value), float(error), float(own))
             for name, value, error, own in zip(gravity_model.gravity.base.names, fit.theta, sd, freedom, strict=False)
         ],
         effects=[
@@ -151,7 +154,7 @@ def identify_static(
                 effects, *(x[Y.shape[2] :] for x in (fit.theta, sd, freedom)), strict=True
             )
         ],
-        joints=_statistics(recording, arm, fit, validated, usable, feedforward_scale),
+        joints=_statistics(recording, arm, (residuals, leave_one_out, validated), usable, feedforward_scale),
         provenance=Provenance(
             recording=recording.source,
             sha256=recording.sha256,
@@ -166,8 +169,8 @@ def identify_static(
         model=model,
         recording=recording,
         excluded=excluded,
-        residuals=fit.residuals,
-        leave_one_out_residuals=fit.leave_one_out_residuals,
+        residuals=residuals,
+        leave_one_out_residuals=leave_one_out,
         cross_validation_residuals=validated,
         usable=usable,
     )
@@ -181,12 +184,21 @@ def usable_poses(recording: Recording, arm: Arm, averaged: bool = True) -> Recor
         IdentificationError: There are too few poses, or the recording is a motion.
     """
     recording.check_fits(arm)
-    recording = recording.in_joint_coordinates(arm)
-    _check_rest(recording, arm)
+    recording, source = recording.in_joint_coordinates(arm), recording.source or "recording"
+    if motion := recording.motion(arm):
+        raise IdentificationError(
+            f"{source}: the arm moves ({motion}). Static identification requires poses at rest (below "
+            f"{REST_SPEED[0]} rad/s)."
+        )
     if averaged:
         recording = average_repeated_poses(recording, arm)
     recording.measured_effort()
-    _check_poses(recording, arm)
+    if len(recording) < MIN_POSES:
+        raise IdentificationError(
+            f"{source}: {len(recording)} distinct pose{'s' * (len(recording) != 1)} found. Identification requires at "
+            f"least {MIN_POSES}. Record 40 or more poses that cover the range of the arm."
+        )
+    check_effort_unit(recording, arm)
     return recording
 
 
@@ -211,23 +223,6 @@ def average_repeated_poses(recording: Recording, arm: Arm) -> Recording:
         t=None,
         lines=None if recording.lines is None else recording.lines[first],
     )
-
-
-def _check_rest(recording: Recording, arm: Arm) -> None:
-    if motion := recording.motion(arm):
-        raise IdentificationError(
-            f"{recording.source or 'recording'}: the arm moves ({motion}). Static identification requires poses at "
-            f"rest (below {REST_SPEED[0]} rad/s)."
-        )
-
-
-def _check_poses(recording: Recording, arm: Arm) -> None:
-    if len(recording) < MIN_POSES:
-        raise IdentificationError(
-            f"{recording.source or 'recording'}: {len(recording)} distinct pose{'s' * (len(recording) != 1)} found. "
-            f"Identification requires at least {MIN_POSES}. Record 40 or more poses that cover the range of the arm."
-        )
-    check_effort_unit(recording, arm)
 
 
 def _feedforward_scales(
@@ -279,44 +274,28 @@ def _cross_validate(problem: StaticProblem, progress: Callable[[float], object])
     return residuals
 
 
-def _scaled(fit: LinearFit, tau: NDArray[np.float64], feedforward_scale: NDArray[np.float64]) -> LinearFit:
-    """Multiplies the predictions of a fit by the feedforward scale (n,) and returns the fit with the new residuals."""
-    return LinearFit(
-        fit.theta,
-        fit.covariance,
-        tau - feedforward_scale * (tau - fit.residuals),
-        tau - feedforward_scale * (tau - fit.leave_one_out_residuals),
-    )
-
-
 def _statistics(
     recording: Recording,
     arm: Arm,
-    fit: LinearFit,
-    validated: NDArray[np.float64],
+    errors: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
     usable: NDArray[np.bool_],
     feedforward_scale: NDArray[np.float64],
 ) -> list[JointStatistics]:
-    tau = recording.measured_effort()
+    """Returns the statistics of the joints for the errors (m, n) of the fit, of leave-one-out and of held-out folds."""
     statistics = []
     for j, name in enumerate(arm.joint_names):
-        use = usable[:, j]
-        lower, upper = recording.q[:, j].min(), recording.q[:, j].max()
+        lower, upper = float(recording.q[:, j].min()), float(recording.q[:, j].max())
+        columns = [values[:, j] for values in (recording.measured_effort(), *errors)]
         statistics.append(
             JointStatistics(
-                name=name,
-                rms_zero_torque=rms(tau[:, j]),
-                rms_fit=rms(fit.residuals[:, j]),
-                rms_leave_one_out=rms(fit.leave_one_out_residuals[:, j]),
-                rms_zero_torque_included=rms(tau[use, j]),
-                rms_fit_included=rms(fit.residuals[use, j]),
-                rms_leave_one_out_included=rms(fit.leave_one_out_residuals[use, j]),
-                rms_cross_validation_included=rms(validated[use, j]),
-                num_excluded=int(np.sum(~use)),
+                name,
+                *(rms(column) for column in columns[:3]),
+                *(rms(column[usable[:, j]]) for column in columns),
+                num_excluded=int(np.sum(~usable[:, j])),
                 feedforward_scale=float(feedforward_scale[j]),
-                position_lower=float(lower),
-                position_upper=float(upper),
-                coverage=float((upper - lower) / (arm.position_upper[j] - arm.position_lower[j])),
+                position_lower=lower,
+                position_upper=upper,
+                coverage=(upper - lower) / float(arm.position_upper[j] - arm.position_lower[j]),
             )
         )
     return statistics

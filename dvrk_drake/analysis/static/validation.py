@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.estimation.robust_fit import rms
-from dvrk_drake.analysis.results import Validation
+from dvrk_drake.analysis.results import JudgedError, Validation
 from dvrk_drake.analysis.static.excluded_measurements import (
     ExcludedMeasurement,
     check_effort_unit,
@@ -16,19 +16,17 @@ from dvrk_drake.analysis.static.excluded_measurements import (
     usable_measurements,
 )
 from dvrk_drake.analysis.verdict import NEGLIGIBLE, coverage, judge, rule_text, tolerances
-from dvrk_drake.dynamics.identified_model import IdentifiedModel, Verdict
-from dvrk_drake.models.arm import Arm
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.recordings.recording import Coordinates, Recording, file_transmission
 
 
-@dataclass(frozen=True)
-class JointError:
+@dataclass(frozen=True, kw_only=True)
+class JointError(JudgedError):
     """RMS torque error of one joint over a recording, in the coordinates of the recording.
 
     Attributes with the suffix `_included` omit the excluded measurements.
 
     Attributes:
-        name: Name of the joint.
         rms_torque: RMS measured torque [N m, N if prismatic]. It is also the RMS error of zero torque.
         rms_error: RMS of measured minus predicted torque [N m, N if prismatic].
         relative_error: rms_error / rms_torque [1], None if rms_torque is 0.
@@ -37,11 +35,8 @@ class JointError:
         relative_error_included: rms_error_included / rms_torque_included [1], None if rms_torque_included is 0.
         num_excluded: Number of measurements that are excluded because the joint is at a stop or the effort is beyond
             its limit.
-        coverage: Share of the range between the limits that the recording covers, see `verdict.coverage` [1].
-        verdict: Verdict from the included measurements, see `judge`.
     """
 
-    name: str
     rms_torque: float
     rms_error: float
     relative_error: float | None
@@ -49,8 +44,11 @@ class JointError:
     rms_error_included: float
     relative_error_included: float | None
     num_excluded: int
-    coverage: float
-    verdict: Verdict
+
+    @property
+    def judged_error(self) -> float | None:
+        """Relative error for the verdict, without the excluded measurements."""
+        return self.relative_error_included
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
@@ -72,17 +70,9 @@ class StaticValidation(Validation):
     usable: NDArray[np.bool_]
 
     @property
-    def verdicts(self) -> dict[str, Verdict]:
-        """Verdict on each joint."""
-        return {joint.name: joint.verdict for joint in self.joints}
-
-    @property
-    def relative_errors(self) -> dict[str, float | None]:
-        """Ratio of RMS error to RMS measured effort of each joint [1], None if the effort is 0.
-
-        Excluded measurements are not used.
-        """
-        return {joint.name: joint.relative_error_included for joint in self.joints}
+    def errors(self) -> list[JointError]:
+        """Errors of the joints."""
+        return self.joints
 
     def as_dict(self) -> dict:
         """Returns the output of `validate --json` as a dictionary."""
@@ -142,45 +132,33 @@ def validate_static(model: IdentifiedModel, recording: Recording) -> StaticValid
         usable = ~((~usable) @ (arm.transmission.matrix.T != 0))
     usable = usable & ~recording.unmeasured
     covered = coverage(arm, np.ptp(in_joints.q, axis=0), recording.coordinates)
-    errors = _joint_errors(arm, recording, predicted, usable, covered)
+    joints = []
+    for j, (name, tolerance) in enumerate(zip(arm.joint_names, tolerances(arm, recording.coordinates), strict=True)):
+        use = usable[:, j]
+        torque, error = rms(measured[:, j]), rms(residuals[:, j])
+        torque_used, error_used = rms(measured[use, j]), rms(residuals[use, j])
+        is_negligible = rms(predicted[:, j]) <= NEGLIGIBLE * tolerance.friction and error_used <= tolerance.friction
+        commanded = bool(np.any(predicted[:, j])) and not is_negligible
+        joints.append(
+            JointError(
+                name=name,
+                rms_torque=torque,
+                rms_error=error,
+                relative_error=error / torque if torque > 0 else None,
+                rms_torque_included=torque_used,
+                rms_error_included=error_used,
+                relative_error_included=error_used / torque_used if torque_used > 0 else None,
+                num_excluded=int(np.sum(~use)),
+                coverage=float(covered[j]),
+                verdict=judge(torque_used, error_used, tolerance, float(covered[j]), commanded=commanded),
+            )
+        )
     return StaticValidation(
         model=model,
         recording=recording,
-        joints=errors,
+        joints=joints,
         poses=len(recording),
         residuals=residuals,
         excluded=excluded,
         usable=usable,
     )
-
-
-def _joint_errors(
-    arm: Arm,
-    recording: Recording,
-    predicted: NDArray[np.float64],
-    usable: NDArray[np.bool_],
-    covered: NDArray[np.float64],
-) -> list[JointError]:
-    measured = recording.measured_effort()
-    errors = []
-    for j, (name, tolerance) in enumerate(zip(arm.joint_names, tolerances(arm, recording.coordinates), strict=True)):
-        use = usable[:, j]
-        torque, error = (rms(tau[:, j]) for tau in (measured, measured - predicted))
-        torque_used, error_used = (rms(tau[use, j]) for tau in (measured, measured - predicted))
-        is_negligible = rms(predicted[:, j]) <= NEGLIGIBLE * tolerance.friction and error_used <= tolerance.friction
-        commanded = bool(np.any(predicted[:, j])) and not is_negligible
-        errors.append(
-            JointError(
-                name,
-                torque,
-                error,
-                error / torque if torque > 0 else None,
-                torque_used,
-                error_used,
-                error_used / torque_used if torque_used > 0 else None,
-                int(np.sum(~use)),
-                float(covered[j]),
-                judge(torque_used, error_used, tolerance, float(covered[j]), commanded=commanded),
-            )
-        )
-    return errors

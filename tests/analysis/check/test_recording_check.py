@@ -226,7 +226,7 @@ def test_command_refuses_with_exit_code_2(tmp_path, capsys):
 def test_motion_with_decreasing_times_is_not_poses(rows):
     motion = clean_motion()
     shuffled = Recording(q=motion.q[rows], tau=motion.tau[rows], qd=motion.qd[rows], t=motion.t[rows])
-    with pytest.raises(RecordingError, match="t does not increase"):
+    with pytest.raises(RecordingError, match="is not greater than"):
         Observations(shuffled, load_arm("psm")).poses()
 
 

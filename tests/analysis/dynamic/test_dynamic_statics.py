@@ -113,7 +113,9 @@ def test_poses_and_motions_use_the_same_columns(case):
     effects = all_effects(arm)
     q = arm.sample_poses(50, np.random.default_rng(2))
     model = static_model(arm, effects)
-    for effect, theta in zip(effects, np.eye(model.num_parameters)[-len(effects) :], strict=True):
+    for effect, theta in zip(
+        effects, np.eye(len(model.gravity.base.names) + len(effects))[-len(effects) :], strict=True
+    ):
         column = np.empty(q.shape)
         for pose, out in zip(q, column, strict=True):
             holding_torque_into(pose, model.with_parameters(theta), out)
