@@ -35,8 +35,8 @@ from pathlib import Path
 import numpy as np
 
 from dvrk_drake.analysis.check.recording_check import check_with_channels
-from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
-from dvrk_drake.analysis.dynamic.validation import validate_motion
+from dvrk_drake.analysis.motion_identification import identify_dynamic
+from dvrk_drake.analysis.motion_validation import validate_motion
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import IdentificationError

@@ -34,8 +34,8 @@ import numpy as np
 from timing import print_table
 
 from dvrk_drake.analysis.check.recording_check import check_recording
-from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
-from dvrk_drake.analysis.dynamic.validation import validate_motion
+from dvrk_drake.analysis.motion_identification import identify_dynamic
+from dvrk_drake.analysis.motion_validation import validate_motion
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.recalibration import cross_validated_errors
 from dvrk_drake.dynamics.dynamic_model import DynamicModel

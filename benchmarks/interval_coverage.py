@@ -13,8 +13,8 @@ import sys
 
 import numpy as np
 
-from dvrk_drake.analysis.static.effect_selection import StaticProblem
-from dvrk_drake.analysis.static.static_identification import identify_static
+from dvrk_drake.analysis.estimation.pose_effects import StaticProblem
+from dvrk_drake.analysis.pose_identification import identify_static
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.static_model import static_model
 from dvrk_drake.models.arm_files import load_arm

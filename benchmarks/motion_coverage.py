@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from dvrk_drake.analysis.dynamic.dynamic_identification import motion_problem
-from dvrk_drake.analysis.dynamic.estimates import ResidualSeries, parameter_covariance
+from dvrk_drake.analysis.estimation.motion_estimates import ResidualSeries, parameter_covariance
+from dvrk_drake.analysis.motion_identification import motion_problem
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.dynamics.dynamic_regressor import derive_base_parameters
 from dvrk_drake.models.arm import Arm

@@ -14,8 +14,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from dvrk_drake.analysis.dynamic.dynamic_identification import motion_problem
-from dvrk_drake.analysis.dynamic.effect_selection import NUM_HELD_OUT_FOLDS, select_effects
+from dvrk_drake.analysis.estimation.motion_effects import NUM_HELD_OUT_FOLDS, select_effects
+from dvrk_drake.analysis.motion_identification import motion_problem
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.observations.repetition import FOLDS
 from dvrk_drake.models.arm_files import load_arm

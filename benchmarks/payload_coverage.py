@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from dvrk_drake.analysis.observations.observations import Observations
-from dvrk_drake.analysis.payload.payload import estimate_payload
+from dvrk_drake.analysis.payload import estimate_payload
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 from loaded_arm import two_days

@@ -19,11 +19,11 @@ from pathlib import Path
 
 import numpy as np
 
-from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
-from dvrk_drake.analysis.dynamic.validation import validate_motion
+from dvrk_drake.analysis.estimation.point_mass import point_mass_parameters
+from dvrk_drake.analysis.motion_identification import identify_dynamic
+from dvrk_drake.analysis.motion_validation import validate_motion
 from dvrk_drake.analysis.observations.observations import Observations
-from dvrk_drake.analysis.payload.payload import Payload, estimate_payload
-from dvrk_drake.analysis.payload.point_mass import point_mass_parameters
+from dvrk_drake.analysis.payload import Payload, estimate_payload
 from dvrk_drake.analysis.recalibration import cross_validated_errors, refit_friction
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from dvrk_drake.analysis.excitation.motion_limits import MotionLimits
     from dvrk_drake.analysis.excitation.static_poses import design_poses
     from dvrk_drake.analysis.identification import identify
-    from dvrk_drake.analysis.payload.payload import payload
+    from dvrk_drake.analysis.payload import payload
     from dvrk_drake.analysis.recalibration import recalibrate
     from dvrk_drake.analysis.validation import predict, validate
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -79,7 +79,7 @@ _MODULES = {
     "lock_joints": "models.locked_joints",
     "load_scenario": "experiments.scenario",
     "load_station_config": "systems.station_config",
-    "payload": "analysis.payload.payload",
+    "payload": "analysis.payload",
     "predict": "analysis.validation",
     "read_recording": "recordings.reading",
     "recalibrate": "analysis.recalibration",

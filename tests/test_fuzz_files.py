@@ -279,7 +279,7 @@ WORK = (
     "dvrk_drake.experiments.study.study.run_study_locally",
     "dvrk_drake.experiments.transparency.simulate_operator",
     "dvrk_drake.analysis.identification.identify_dynamic",
-    "dvrk_drake.analysis.payload.payload.estimate_payload",
+    "dvrk_drake.analysis.payload.estimate_payload",
 )
 #: Mapping from a command to the files that are damaged one after the other. Output names begin with "out".
 COMMANDS = {

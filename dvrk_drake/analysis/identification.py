@@ -10,13 +10,13 @@ import numpy as np
 
 from dvrk_drake.analysis.check.mounting import find_mounting, is_assumed
 from dvrk_drake.analysis.check.recording_check import require_usable, with_power
-from dvrk_drake.analysis.dynamic.dynamic_identification import DynamicIdentification, identify_dynamic
 from dvrk_drake.analysis.effects_at_rest import MIN_NUM_POSES, with_effects_at_rest
+from dvrk_drake.analysis.estimation.gravity_direction import LARGE_TILT
+from dvrk_drake.analysis.estimation.gravity_direction import estimate_gravity as gravity_direction
+from dvrk_drake.analysis.motion_identification import DynamicIdentification, identify_dynamic
 from dvrk_drake.analysis.observations.finding import Finding
 from dvrk_drake.analysis.observations.observations import Observations, Poses
-from dvrk_drake.analysis.static.gravity_direction import LARGE_TILT
-from dvrk_drake.analysis.static.gravity_direction import estimate_gravity as gravity_direction
-from dvrk_drake.analysis.static.static_identification import Method, StaticIdentification, identify_static
+from dvrk_drake.analysis.pose_identification import Method, StaticIdentification, identify_static
 from dvrk_drake.analysis.verdict import unexplained_effort
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.identified_model import IdentifiedModel

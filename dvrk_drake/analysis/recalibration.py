@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.check.recording_check import require_usable, with_power
-from dvrk_drake.analysis.dynamic.estimates import MAX_CORRELATION_TIME
 from dvrk_drake.analysis.estimation.estimator import Estimator, Prior
+from dvrk_drake.analysis.estimation.motion_estimates import MAX_CORRELATION_TIME
 from dvrk_drake.analysis.estimation.normal_equations import NormalEquations, fold_sums
 from dvrk_drake.analysis.estimation.priors import EFFECT_DEVIATION
 from dvrk_drake.analysis.observations.drive_efforts import (

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from dvrk_drake.analysis.check.recording_check import require_usable, with_power
-from dvrk_drake.analysis.dynamic.validation import (
+from dvrk_drake.analysis.motion_validation import (
     DynamicValidation,
     find_other_robot,
     predict_motion,
@@ -15,9 +15,9 @@ from dvrk_drake.analysis.dynamic.validation import (
 )
 from dvrk_drake.analysis.observations.finding import Finding
 from dvrk_drake.analysis.observations.observations import Observations
+from dvrk_drake.analysis.pose_identification import MIN_POSES
+from dvrk_drake.analysis.pose_validation import StaticValidation, predict_static, validate_static
 from dvrk_drake.analysis.results import Prediction
-from dvrk_drake.analysis.static.static_identification import MIN_POSES
-from dvrk_drake.analysis.static.validation import StaticValidation, predict_static, validate_static
 from dvrk_drake.analysis.verdict import unexplained_effort
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import RecordingError

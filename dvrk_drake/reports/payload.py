@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from dvrk_drake.analysis.payload.payload import (
+from dvrk_drake.analysis.payload import (
     CONFIDENCE,
     Payload,
     PayloadIdentification,

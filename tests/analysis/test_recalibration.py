@@ -8,7 +8,7 @@ from command_output import messages, refusal
 from loaded_arm import friction, other_day
 from motions import fourier_motion, recorded, true_dynamics
 
-from dvrk_drake.analysis.dynamic.validation import validate_motion
+from dvrk_drake.analysis.motion_validation import validate_motion
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.recalibration import cross_validated_errors, refit_friction
 from dvrk_drake.cli import main

@@ -14,7 +14,7 @@ import pytest
 from command_output import refusal
 from robot_file import write_robot
 
-from dvrk_drake.analysis.static.validation import validate_static
+from dvrk_drake.analysis.pose_validation import validate_static
 from dvrk_drake.analysis.verdict import (
     LARGEST_RATIO,
     LARGEST_RATIO_IN_FRICTION,

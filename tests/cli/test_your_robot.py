@@ -7,7 +7,7 @@ from robot_file import random_robot
 from robot_motion import random_motion
 
 import dvrk_drake as dvrk
-from dvrk_drake.analysis.payload.point_mass import point_mass_parameters
+from dvrk_drake.analysis.estimation.point_mass import point_mass_parameters
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia, link_inertias
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from command_output import messages, refusal
 
-from dvrk_drake.analysis.static.static_identification import identify_static
-from dvrk_drake.analysis.static.validation import validate_static
+from dvrk_drake.analysis.pose_identification import identify_static
+from dvrk_drake.analysis.pose_validation import validate_static
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ModelError

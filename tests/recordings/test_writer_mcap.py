@@ -15,7 +15,7 @@ from recordings import random_recording
 from rosbags.highlevel import AnyReader
 
 from dvrk_drake.analysis.identification import identify
-from dvrk_drake.analysis.static.static_identification import StaticIdentification
+from dvrk_drake.analysis.pose_identification import StaticIdentification
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm_files import load_arm

@@ -10,7 +10,7 @@ import pytest
 import dvrk_drake as dvrk
 
 if TYPE_CHECKING:
-    from dvrk_drake.analysis.static.static_identification import StaticIdentification
+    from dvrk_drake.analysis.pose_identification import StaticIdentification
 
 
 @dataclass(frozen=True)

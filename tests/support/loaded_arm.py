@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from motions import fourier_motion, recorded, true_dynamics
 
-from dvrk_drake.analysis.payload.point_mass import point_mass_parameters
+from dvrk_drake.analysis.estimation.point_mass import point_mass_parameters
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_section import DynamicSection
 from dvrk_drake.models.arm_files import load_arm

@@ -8,12 +8,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.dynamic.columns import DIRECTION_WIDTH, BaseColumns, base_columns, named_effects
-from dvrk_drake.analysis.dynamic.problem import MIN_INFORMATION
+from dvrk_drake.analysis.check.effort_lag import NUM_INDEPENDENT
 from dvrk_drake.analysis.estimation.estimator import ASSUMED_ERROR, MIN_ERROR, Estimator, Prior
+from dvrk_drake.analysis.estimation.motion_columns import DIRECTION_WIDTH, BaseColumns, base_columns, named_effects
+from dvrk_drake.analysis.estimation.motion_problem import MIN_INFORMATION
 from dvrk_drake.analysis.estimation.normal_equations import NormalEquations
 from dvrk_drake.analysis.estimation.priors import EFFECT_DEVIATION, KNOWN_SHARE, TILT_DEVIATION, rigid_deviations
-from dvrk_drake.analysis.observations.effort_lag import NUM_INDEPENDENT
 from dvrk_drake.analysis.observations.low_pass import low_pass, resample
 from dvrk_drake.analysis.observations.motion_grid import GRID_RATE, MotionGrid, ends_of
 from dvrk_drake.analysis.observations.observations import Observations

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from dvrk_drake.analysis.check.effort_lag import CUT_OFF, MAX_LAG, MIN_ERRORS, EffortLag, effort_lag
 from dvrk_drake.analysis.check.report import RecordingReport
-from dvrk_drake.analysis.dynamic.estimates import STRONG_CORRELATION
-from dvrk_drake.analysis.observations.effort_lag import CUT_OFF, MAX_LAG, MIN_ERRORS, EffortLag, effort_lag
+from dvrk_drake.analysis.estimation.motion_estimates import STRONG_CORRELATION
 from dvrk_drake.analysis.observations.finding import Finding, Severity
 from dvrk_drake.analysis.observations.low_pass import resample
 from dvrk_drake.analysis.observations.motion_grid import GRID_RATE, MotionSignals, motion_signals

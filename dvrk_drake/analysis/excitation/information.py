@@ -9,8 +9,8 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.dynamic.columns import COULOMB_WIDTHS, BaseColumns, base_columns
 from dvrk_drake.analysis.estimation.estimator import ASSUMED_ERROR
+from dvrk_drake.analysis.estimation.motion_columns import COULOMB_WIDTHS, BaseColumns, base_columns
 from dvrk_drake.analysis.estimation.priors import KNOWN_SHARE, rigid_deviations
 from dvrk_drake.analysis.excitation.motion_limits import MotionLimits
 from dvrk_drake.analysis.excitation.predicted_effort import PredictedEffort

@@ -16,8 +16,8 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput, TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 
-from dvrk_drake.analysis.static.static_identification import StaticIdentification, identify_static
-from dvrk_drake.analysis.static.validation import StaticValidation, validate_static
+from dvrk_drake.analysis.pose_identification import StaticIdentification, identify_static
+from dvrk_drake.analysis.pose_validation import StaticValidation, validate_static
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import link_inertias
 from dvrk_drake.errors import ArmError

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.static.static_identification import identify_static
+from dvrk_drake.analysis.pose_identification import identify_static
 from dvrk_drake.dynamics.friction_compensation import Friction
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.experiments.ground_truth import GroundTruth, collect, paper_arm, perturbed_ground_truth

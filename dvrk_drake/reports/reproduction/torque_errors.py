@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.static.static_identification import StaticIdentification, identify_static
+from dvrk_drake.analysis.pose_identification import StaticIdentification, identify_static
 from dvrk_drake.experiments.reproduction.published import FIGURE_4_MEANS, PAPER_ARM, PaperRecordings
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.reports.colours import HELD_OUT, LIMIT, MEASURED, REFERENCE

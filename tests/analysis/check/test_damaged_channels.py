@@ -9,7 +9,7 @@ from synthetic_motion import RATE, trajectory
 
 from dvrk_drake.analysis.check.channel_check import check_channels
 from dvrk_drake.analysis.check.recording_check import check_with_channels
-from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
+from dvrk_drake.analysis.motion_identification import identify_dynamic
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect

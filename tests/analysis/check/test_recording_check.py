@@ -10,9 +10,9 @@ from command_output import refusal
 from figure_rules import checked_figures
 from synthetic_motion import EFFORT_NOISE, PERIOD, RATE, clean_motion
 
+from dvrk_drake.analysis.check.effort_lag import EffortLag
 from dvrk_drake.analysis.check.motion_check import _lags
 from dvrk_drake.analysis.check.recording_check import check_recording
-from dvrk_drake.analysis.observations.effort_lag import EffortLag
 from dvrk_drake.analysis.observations.low_pass import low_pass
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.cli import main

@@ -7,7 +7,7 @@ import pytest
 
 import dvrk_drake as dvrk
 from dvrk_drake.analysis.estimation.robust_fit import blocks, rms, robust_fit
-from dvrk_drake.analysis.static.static_identification import identify_static
+from dvrk_drake.analysis.pose_identification import identify_static
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.models.effects_schema import half_width
 from dvrk_drake.recordings.recording import Recording

@@ -9,11 +9,11 @@ from command_output import refusal
 from motions import fourier_motion, friction_everywhere, recorded, true_dynamics
 
 import dvrk_drake as dvrk
-from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
 from dvrk_drake.analysis.excitation.information import MotionInformation
 from dvrk_drake.analysis.excitation.motion_limits import MotionLimits, motion_violations
 from dvrk_drake.analysis.excitation.predicted_effort import PredictedEffort
 from dvrk_drake.analysis.excitation.random_motion import random_motion, state_of
+from dvrk_drake.analysis.motion_identification import identify_dynamic
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.cli import main
 from dvrk_drake.errors import ExcitationError

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.dynamic.columns import DIRECTION_WIDTH
+from dvrk_drake.analysis.estimation.motion_columns import DIRECTION_WIDTH
 from dvrk_drake.analysis.estimation.robust_fit import rms
 from dvrk_drake.analysis.observations.finding import Finding
 from dvrk_drake.analysis.observations.motion_grid import MotionGrid

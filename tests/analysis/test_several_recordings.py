@@ -10,11 +10,11 @@ from motions import fourier_motion, friction_everywhere, recorded, true_dynamics
 
 import dvrk_drake as dvrk
 from dvrk_drake.analysis import identification
-from dvrk_drake.analysis.dynamic.dynamic_identification import thinned
-from dvrk_drake.analysis.dynamic.validation import validate_motion
 from dvrk_drake.analysis.effects_at_rest import with_effects_at_rest
+from dvrk_drake.analysis.motion_identification import thinned
+from dvrk_drake.analysis.motion_validation import validate_motion
 from dvrk_drake.analysis.observations.observations import Observations
-from dvrk_drake.analysis.static.static_identification import identify_static
+from dvrk_drake.analysis.pose_identification import identify_static
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.dynamic_model import DynamicModel

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.dynamic.problem import ConsistentFit, ConsistentProgram, DynamicProblem
 from dvrk_drake.analysis.estimation.estimator import StepwiseSelection
+from dvrk_drake.analysis.estimation.motion_problem import ConsistentFit, ConsistentProgram, DynamicProblem
 from dvrk_drake.analysis.estimation.normal_equations import NormalEquations
 from dvrk_drake.models.arm_files import has_converted_model
 

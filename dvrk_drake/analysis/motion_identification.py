@@ -9,15 +9,15 @@ from importlib.metadata import version
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.dynamic.columns import (
+from dvrk_drake.analysis.estimation.motion_columns import (
     DynamicColumns,
     RecordingEffect,
     drive_effects,
     dynamic_columns,
     optional_effects,
 )
-from dvrk_drake.analysis.dynamic.effect_selection import cross_validate, select_effects
-from dvrk_drake.analysis.dynamic.estimates import (
+from dvrk_drake.analysis.estimation.motion_effects import cross_validate, select_effects
+from dvrk_drake.analysis.estimation.motion_estimates import (
     ParameterCovariance,
     ResidualSeries,
     base_parameter_estimates,
@@ -26,7 +26,7 @@ from dvrk_drake.analysis.dynamic.estimates import (
     motion_parameters,
     parameter_covariance,
 )
-from dvrk_drake.analysis.dynamic.problem import ConsistentFit, DynamicProblem
+from dvrk_drake.analysis.estimation.motion_problem import ConsistentFit, DynamicProblem
 from dvrk_drake.analysis.observations.motion_grid import MotionGrid
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.observations.repetition import (

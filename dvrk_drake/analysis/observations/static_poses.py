@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.observations.low_pass import low_pass
 from dvrk_drake.analysis.observations.true_time import CUT_OFF, ORDER
-from dvrk_drake.analysis.static.static_identification import average_repeated_poses
+from dvrk_drake.analysis.pose_identification import average_repeated_poses
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.recording import MAX_PERIOD, SAME_POSE, Recording
 

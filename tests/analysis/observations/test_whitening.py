@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.signal import lfilter
 
-from dvrk_drake.analysis.payload.motion_difference import Whitening
+from dvrk_drake.analysis.observations.motion_difference import Whitening
 
 RATE, CUT_OFF = 40.0, 5.0
 STEP = 4

@@ -11,8 +11,8 @@ from motions import fourier_motion, friction_everywhere, recorded, true_dynamics
 from recordings import csv_block
 from report_pages import printed
 
-from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic, motion_problem
-from dvrk_drake.analysis.dynamic.validation import predict_motion, validate_motion
+from dvrk_drake.analysis.motion_identification import identify_dynamic, motion_problem
+from dvrk_drake.analysis.motion_validation import predict_motion, validate_motion
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.validation import predict
 from dvrk_drake.cli import main

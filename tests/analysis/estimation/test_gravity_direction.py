@@ -7,7 +7,7 @@ import pytest
 from command_output import refusal
 
 import dvrk_drake as dvrk
-from dvrk_drake.analysis.static.gravity_direction import LARGE_TILT, estimate_gravity
+from dvrk_drake.analysis.estimation.gravity_direction import LARGE_TILT, estimate_gravity
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.errors import IdentificationError

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.dynamic.columns import DIRECTION_WIDTH
+from dvrk_drake.analysis.estimation.motion_columns import DIRECTION_WIDTH
 from dvrk_drake.analysis.observations.low_pass import low_pass
 from dvrk_drake.analysis.observations.motion_grid import MotionSignals, ends_of
 from dvrk_drake.analysis.observations.true_time import MAX_ROWS

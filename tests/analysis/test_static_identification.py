@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from dvrk_drake.analysis.estimation.robust_fit import robust_fit, weighted_fit
-from dvrk_drake.analysis.static.excluded_measurements import find_excluded
-from dvrk_drake.analysis.static.static_identification import identify_static
-from dvrk_drake.analysis.static.validation import predict_static, validate_static
+from dvrk_drake.analysis.observations.excluded_measurements import find_excluded
+from dvrk_drake.analysis.pose_identification import identify_static
+from dvrk_drake.analysis.pose_validation import predict_static, validate_static
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.identified_model import FORMAT, IdentifiedModel
 from dvrk_drake.dynamics.static_model import static_model
@@ -71,7 +71,7 @@ def test_standard_errors_cover_the_truth_at_the_nominal_rate(arm):
     for seed in range(40):
         recording, theta = simulated(arm, noise=0.02, seed=seed)
         usable = np.ones(recording.q.shape, dtype=bool)
-        from dvrk_drake.analysis.static.effect_selection import StaticProblem
+        from dvrk_drake.analysis.estimation.pose_effects import StaticProblem
 
         fit = StaticProblem(arm, recording.q, recording.tau, usable).fit(()).fit
         inside.append(np.abs(fit.theta - theta) < 1.96 * np.sqrt(np.diag(fit.covariance)))

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dvrk_drake.analysis.dynamic.columns import drive_effects, optional_effects
 from dvrk_drake.analysis.estimation.estimator import Estimator, Prior, StepwiseSelection
+from dvrk_drake.analysis.estimation.motion_columns import drive_effects, optional_effects
 from dvrk_drake.analysis.estimation.normal_equations import NormalEquations
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm_files import load_arm

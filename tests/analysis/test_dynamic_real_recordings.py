@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from recordings import csv_block
 
-from dvrk_drake.analysis.dynamic.validation import validate_motion
 from dvrk_drake.analysis.effects_at_rest import with_effects_at_rest
+from dvrk_drake.analysis.motion_validation import validate_motion
 from dvrk_drake.analysis.observations.observations import Observations
+from dvrk_drake.analysis.pose_identification import identify_static
 from dvrk_drake.analysis.recalibration import refit_friction
-from dvrk_drake.analysis.static.static_identification import identify_static
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import pseudo_inertia

@@ -9,8 +9,8 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.dynamic.columns import DynamicColumns, RecordingEffect
 from dvrk_drake.analysis.estimation.estimator import ASSUMED_ERROR, Prior, StepwiseSelection
+from dvrk_drake.analysis.estimation.motion_columns import DynamicColumns, RecordingEffect
 from dvrk_drake.analysis.estimation.normal_equations import NormalEquations, OwnColumns, fold_sums
 from dvrk_drake.analysis.estimation.priors import KNOWN_SHARE, TILT_DEVIATION, rigid_deviations
 from dvrk_drake.analysis.observations.motion_grid import MotionGrid

@@ -6,8 +6,8 @@ from command_output import refusal
 from motions import fourier_motion, true_dynamics
 
 from dvrk_drake.analysis.check.recording_check import check
-from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
-from dvrk_drake.analysis.dynamic.validation import validate_motion
+from dvrk_drake.analysis.motion_identification import identify_dynamic
+from dvrk_drake.analysis.motion_validation import validate_motion
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.gravity_parameters import gravity_parameters

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dvrk_drake.analysis.dynamic.estimates import strong_correlations
+from dvrk_drake.analysis.estimation.motion_estimates import strong_correlations
 
 pytestmark = pytest.mark.numeric
 

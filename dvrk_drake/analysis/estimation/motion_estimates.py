@@ -9,8 +9,8 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.dynamic.columns import RecordingEffect
-from dvrk_drake.analysis.dynamic.problem import ConsistentFit, DynamicProblem
+from dvrk_drake.analysis.estimation.motion_columns import RecordingEffect
+from dvrk_drake.analysis.estimation.motion_problem import ConsistentFit, DynamicProblem
 from dvrk_drake.analysis.estimation.normal_equations import NormalEquations
 from dvrk_drake.analysis.observations.low_pass import correlation
 from dvrk_drake.dynamics.dynamic_regressor import derive_base_parameters

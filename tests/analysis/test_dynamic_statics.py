@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from motions import true_dynamics
 
-from dvrk_drake.analysis.dynamic.estimates import base_parameter_estimates
+from dvrk_drake.analysis.estimation.motion_estimates import base_parameter_estimates
 from dvrk_drake.dynamics.actuator_effects import (
     ActuatorEffect,
     distinct_coordinates,

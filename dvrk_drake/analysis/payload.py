@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from dvrk_drake.analysis.check.recording_check import require_usable, with_power
-from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
 from dvrk_drake.analysis.estimation.normal_equations import NormalEquations
+from dvrk_drake.analysis.estimation.point_mass import PointMass, PointMassProblem
+from dvrk_drake.analysis.motion_identification import identify_dynamic
 from dvrk_drake.analysis.observations.finding import Finding
+from dvrk_drake.analysis.observations.motion_difference import MotionDifference, Whitening, motion_difference
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.observations.repetition import phase_folds
-from dvrk_drake.analysis.payload.motion_difference import MotionDifference, Whitening, motion_difference
-from dvrk_drake.analysis.payload.point_mass import PointMass, PointMassProblem
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.identified_model import IdentifiedModel

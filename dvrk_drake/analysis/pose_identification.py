@@ -10,16 +10,16 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from dvrk_drake.analysis.estimation.pose_effects import StaticProblem, select_effects
 from dvrk_drake.analysis.estimation.robust_fit import blocks, rms, weighted_fit
-from dvrk_drake.analysis.results import Identification
-from dvrk_drake.analysis.static.effect_selection import StaticProblem, select_effects
-from dvrk_drake.analysis.static.excluded_measurements import (
+from dvrk_drake.analysis.observations.excluded_measurements import (
     ExcludedMeasurement,
     check_effort_unit,
     exclude_outliers,
     find_excluded,
     usable_measurements,
 )
+from dvrk_drake.analysis.results import Identification
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.identified_model import (
     BaseParameterEstimate,

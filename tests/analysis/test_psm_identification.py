@@ -7,7 +7,7 @@ import pytest
 from command_output import refusal
 from recordings import csv_block
 
-from dvrk_drake.analysis.static.static_identification import identify_static
+from dvrk_drake.analysis.pose_identification import identify_static
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.identified_model import IdentifiedModel

@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.estimation.robust_fit import rms
-from dvrk_drake.analysis.results import JudgedError, Validation
-from dvrk_drake.analysis.static.excluded_measurements import (
+from dvrk_drake.analysis.observations.excluded_measurements import (
     ExcludedMeasurement,
     check_effort_unit,
     find_excluded,
     usable_measurements,
 )
+from dvrk_drake.analysis.results import JudgedError, Validation
 from dvrk_drake.analysis.verdict import NEGLIGIBLE, coverage, judge, rule_text, tolerances
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.recordings.recording import Coordinates, Recording, file_transmission

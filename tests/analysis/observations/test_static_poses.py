@@ -7,7 +7,7 @@ import pytest
 from static_poses import motion_with_pauses
 
 from dvrk_drake.analysis.observations.observations import Observations
-from dvrk_drake.analysis.observations.static_segments import smooth_velocity, static_poses, stationary_runs
+from dvrk_drake.analysis.observations.static_poses import smooth_velocity, static_poses, stationary_runs
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm_files import load_arm

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from dvrk_drake.analysis.dynamic.estimates import (
+from dvrk_drake.analysis.estimation.motion_estimates import (
     ResidualSeries,
     error_covariance,
     parameter_covariance,

@@ -10,16 +10,16 @@ from loaded_arm import two_days
 from pydrake.multibody.tree import MultibodyForces
 from report_pages import printed
 
-from dvrk_drake.analysis.dynamic.dynamic_identification import identify_dynamic
+from dvrk_drake.analysis.estimation.point_mass import point_mass_parameters
+from dvrk_drake.analysis.motion_identification import identify_dynamic
 from dvrk_drake.analysis.observations.observations import Observations
-from dvrk_drake.analysis.payload.payload import (
+from dvrk_drake.analysis.payload import (
     PayloadIdentification,
     better_link_warnings,
     equally_good_links,
     estimate_payload,
 )
-from dvrk_drake.analysis.payload.payload import payload as estimate
-from dvrk_drake.analysis.payload.point_mass import point_mass_parameters
+from dvrk_drake.analysis.payload import payload as estimate
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.identified_model import IdentifiedModel

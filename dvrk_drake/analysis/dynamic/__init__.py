@@ -1,1 +1,0 @@
-"""Identification and validation of full dynamic models from motions."""

@@ -1,1 +1,0 @@
-"""Estimation of a payload from two recordings of the same motion."""

@@ -1,1 +1,0 @@
-"""Identification and validation of static models from poses."""
