@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.estimation.estimator import Estimator, Prior
 from dvrk_drake.analysis.estimation.normal_equations import NormalEquations, fold_sums
-from dvrk_drake.analysis.estimation.robust_fit import blocks
-from dvrk_drake.analysis.pose_identification import FOLDS, MIN_MOTION, StaticIdentification
+from dvrk_drake.analysis.estimation.robust_fit import FOLDS, blocks
+from dvrk_drake.analysis.pose_identification import MIN_MOTION, StaticIdentification
 from dvrk_drake.analysis.verdict import NEGLIGIBLE
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, distinct_coordinates, position_along, spring_over
 from dvrk_drake.dynamics.dynamic_model import ROUNDING_EFFORT

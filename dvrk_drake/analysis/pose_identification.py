@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Literal, get_args
 
@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.estimation.pose_effects import StaticProblem, select_effects
-from dvrk_drake.analysis.estimation.robust_fit import blocks, rms, weighted_fit
+from dvrk_drake.analysis.estimation.robust_fit import FOLDS, blocks, rms, weighted_fit
 from dvrk_drake.analysis.observations.excluded_measurements import (
     ExcludedMeasurement,
-    check_effort_unit,
     exclude_outliers,
     find_excluded,
     usable_measurements,
 )
+from dvrk_drake.analysis.observations.static_poses import usable_poses
 from dvrk_drake.analysis.results import Identification
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.identified_model import (
@@ -31,13 +31,10 @@ from dvrk_drake.dynamics.static_model import static_model
 from dvrk_drake.errors import IdentificationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import DriveEffect
-from dvrk_drake.recordings.recording import REST_SPEED, SAME_POSE, Recording
+from dvrk_drake.recordings.recording import Recording
 
 Method = Literal["robust", "paper"]
 
-#: Smallest number of distinct poses for an identification. The efforts of seven joints are then more than three times
-#: as many as the 12 to 15 base parameters of an MTM or a PSM.
-MIN_POSES = 8
 #: Condition for the feedforward of a joint with a small torque. The torque is small if its RMS value, as a share of the
 #: effort limit, is below the first number. The ratio of the leave-one-out error to the RMS torque must then not exceed
 #: the second number.
@@ -47,8 +44,6 @@ MIN_TORQUE, MAX_SMALL_TORQUE_RATIO = 0.02, 0.5
 MIN_MOTION = 0.02
 #: Largest ratio of the leave-one-out error to the RMS torque for a feedforward scale of 1.
 MAX_ERROR_RATIO = 0.98
-#: Number of folds for cross-validation.
-FOLDS = 10
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
@@ -173,55 +168,6 @@ def identify_static(
         leave_one_out_residuals=leave_one_out,
         cross_validation_residuals=validated,
         usable=usable,
-    )
-
-
-def usable_poses(recording: Recording, arm: Arm, averaged: bool = True) -> Recording:
-    """Returns the poses of a recording in joint coordinates. Repeated poses are averaged if `averaged` is True.
-
-    Raises:
-        RecordingError: The recording does not match the arm or has no efforts.
-        IdentificationError: There are too few poses, or the recording is a motion.
-    """
-    recording.check_fits(arm)
-    recording, source = recording.in_joint_coordinates(arm), recording.source or "recording"
-    if motion := recording.motion(arm):
-        raise IdentificationError(
-            f"{source}: the arm moves ({motion}). Static identification requires poses at rest (below "
-            f"{REST_SPEED[0]} rad/s)."
-        )
-    if averaged:
-        recording = average_repeated_poses(recording, arm)
-    recording.measured_effort()
-    if len(recording) < MIN_POSES:
-        raise IdentificationError(
-            f"{source}: {len(recording)} distinct pose{'s' * (len(recording) != 1)} found. Identification requires at "
-            f"least {MIN_POSES}. Record 40 or more poses that cover the range of the arm."
-        )
-    check_effort_unit(recording, arm)
-    return recording
-
-
-def average_repeated_poses(recording: Recording, arm: Arm) -> Recording:
-    """Averages the rows of each repeated pose. Rows are the same pose if all joints agree within `SAME_POSE`."""
-    tolerance = arm.per_joint(*SAME_POSE)
-    groups: list[list[int]] = []
-    for row, q in enumerate(recording.q):
-        group = next((g for g in groups if np.all(np.abs(recording.q[g[0]] - q) < tolerance)), None)
-        if group is None:
-            groups.append([row])
-        else:
-            group.append(row)
-    if len(groups) == len(recording):
-        return recording
-    first = [group[0] for group in groups]
-    return replace(
-        recording,
-        q=np.array([recording.q[g].mean(axis=0) for g in groups]),
-        tau=np.array([recording.measured_effort()[g].mean(axis=0) for g in groups]),
-        qd=None,
-        t=None,
-        lines=None if recording.lines is None else recording.lines[first],
     )
 
 

@@ -15,7 +15,7 @@ from dvrk_drake.analysis.motion_validation import (
 )
 from dvrk_drake.analysis.observations.finding import Finding
 from dvrk_drake.analysis.observations.observations import Observations
-from dvrk_drake.analysis.pose_identification import MIN_POSES
+from dvrk_drake.analysis.observations.static_poses import MIN_POSES
 from dvrk_drake.analysis.pose_validation import StaticValidation, predict_static, validate_static
 from dvrk_drake.analysis.results import Prediction
 from dvrk_drake.analysis.verdict import unexplained_effort

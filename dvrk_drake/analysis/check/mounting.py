@@ -18,7 +18,7 @@ from dvrk_drake.analysis.check.channel_check import MIN_GAIN, segments_of
 from dvrk_drake.analysis.check.channel_fit import ChannelFit
 from dvrk_drake.analysis.observations.finding import Finding
 from dvrk_drake.analysis.observations.observations import Observations
-from dvrk_drake.analysis.pose_identification import MIN_POSES
+from dvrk_drake.analysis.observations.static_poses import MIN_POSES
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import has_converted_model, is_from_model_file

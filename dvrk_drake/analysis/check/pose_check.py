@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.check.effort_lag import MIN_ERRORS
 from dvrk_drake.analysis.observations.excluded_measurements import find_excluded, usable_measurements
 from dvrk_drake.analysis.observations.finding import Finding
-from dvrk_drake.analysis.pose_identification import MIN_POSES, average_repeated_poses
+from dvrk_drake.analysis.observations.static_poses import MIN_POSES, average_repeated_poses
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import holding_torques
 from dvrk_drake.recordings.recording import MAX_MOTION_STEP, Recording

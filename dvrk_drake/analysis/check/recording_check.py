@@ -19,8 +19,8 @@ from dvrk_drake.analysis.observations.finding import Finding, Severity
 from dvrk_drake.analysis.observations.motion_faults import MIN_RETURNS, TIME_UNITS
 from dvrk_drake.analysis.observations.motion_grid import MIN_DURATION
 from dvrk_drake.analysis.observations.observations import Observations
+from dvrk_drake.analysis.observations.static_poses import MIN_POSES, usable_poses
 from dvrk_drake.analysis.observations.true_time import SAME_VALUE, distinct_rows, repeated_rows, time_factor
-from dvrk_drake.analysis.pose_identification import MIN_POSES, usable_poses
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import IdentificationError, RecordingError
 from dvrk_drake.models.arm import Arm

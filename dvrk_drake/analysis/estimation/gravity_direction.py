@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from scipy.stats import t as student
 
 from dvrk_drake.analysis.estimation.pose_effects import BASE_PRIOR, StaticProblem, candidate_effects
-from dvrk_drake.analysis.estimation.robust_fit import blocks, robust_fit
+from dvrk_drake.analysis.estimation.robust_fit import FOLDS, blocks, robust_fit
 from dvrk_drake.analysis.observations.excluded_measurements import find_excluded, usable_measurements
-from dvrk_drake.analysis.pose_identification import FOLDS, usable_poses
+from dvrk_drake.analysis.observations.static_poses import usable_poses
 from dvrk_drake.dynamics.actuator_effects import effect_column
 from dvrk_drake.dynamics.base_parameters import independent_columns
 from dvrk_drake.dynamics.dynamic_model import ROUNDING_EFFORT

@@ -14,9 +14,8 @@ from dvrk_drake.analysis.observations.low_pass import central_difference, low_pa
 from dvrk_drake.analysis.observations.motion_faults import jump_fault, source_fault, time_fault
 from dvrk_drake.analysis.observations.motion_grid import GRID_RATE, MIN_DURATION, MotionGrid, even_times
 from dvrk_drake.analysis.observations.repetition import find_period
-from dvrk_drake.analysis.observations.static_poses import static_poses
+from dvrk_drake.analysis.observations.static_poses import MIN_POSES, static_poses
 from dvrk_drake.analysis.observations.true_time import TrueTime, increasing_times, true_time
-from dvrk_drake.analysis.pose_identification import MIN_POSES
 from dvrk_drake.dynamics.dynamic_section import SignalSettings
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import RecordingError

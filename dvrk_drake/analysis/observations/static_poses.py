@@ -1,4 +1,4 @@
-"""Extracts static poses from a motion."""
+"""Extracts static poses from a motion, and averages repeated poses."""
 
 from __future__ import annotations
 
@@ -8,12 +8,16 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from dvrk_drake.analysis.observations.excluded_measurements import check_effort_unit
 from dvrk_drake.analysis.observations.low_pass import low_pass
 from dvrk_drake.analysis.observations.true_time import CUT_OFF, ORDER
-from dvrk_drake.analysis.pose_identification import average_repeated_poses
+from dvrk_drake.errors import IdentificationError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.recordings.recording import MAX_PERIOD, SAME_POSE, Recording
+from dvrk_drake.recordings.recording import MAX_PERIOD, REST_SPEED, SAME_POSE, Recording
 
+#: Smallest number of distinct poses for an identification. The efforts of seven joints are then more than three times
+#: as many as the 12 to 15 base parameters of an MTM or a PSM.
+MIN_POSES = 8
 #: Largest speed of each joint [rad/s], [m/s] and smallest duration [s] of a static segment. Half or twice these values
 #: changes no finding on the public recordings.
 MAX_REST_SPEED, MIN_REST = (0.02, 0.002), 0.3
@@ -89,3 +93,52 @@ def stationary_runs(
             if stop - start >= min_rows:
                 yield np.arange(start, stop)
             start = stop
+
+
+def usable_poses(recording: Recording, arm: Arm, averaged: bool = True) -> Recording:
+    """Returns the poses of a recording in joint coordinates. Repeated poses are averaged if `averaged` is True.
+
+    Raises:
+        RecordingError: The recording does not match the arm or has no efforts.
+        IdentificationError: There are too few poses, or the recording is a motion.
+    """
+    recording.check_fits(arm)
+    recording, source = recording.in_joint_coordinates(arm), recording.source or "recording"
+    if motion := recording.motion(arm):
+        raise IdentificationError(
+            f"{source}: the arm moves ({motion}). Static identification requires poses at rest (below "
+            f"{REST_SPEED[0]} rad/s)."
+        )
+    if averaged:
+        recording = average_repeated_poses(recording, arm)
+    recording.measured_effort()
+    if len(recording) < MIN_POSES:
+        raise IdentificationError(
+            f"{source}: {len(recording)} distinct pose{'s' * (len(recording) != 1)} found. Identification requires at "
+            f"least {MIN_POSES}. Record 40 or more poses that cover the range of the arm."
+        )
+    check_effort_unit(recording, arm)
+    return recording
+
+
+def average_repeated_poses(recording: Recording, arm: Arm) -> Recording:
+    """Averages the rows of each repeated pose. Rows are the same pose if all joints agree within `SAME_POSE`."""
+    tolerance = arm.per_joint(*SAME_POSE)
+    groups: list[list[int]] = []
+    for row, q in enumerate(recording.q):
+        group = next((g for g in groups if np.all(np.abs(recording.q[g[0]] - q) < tolerance)), None)
+        if group is None:
+            groups.append([row])
+        else:
+            group.append(row)
+    if len(groups) == len(recording):
+        return recording
+    first = [group[0] for group in groups]
+    return replace(
+        recording,
+        q=np.array([recording.q[g].mean(axis=0) for g in groups]),
+        tau=np.array([recording.measured_effort()[g].mean(axis=0) for g in groups]),
+        qd=None,
+        t=None,
+        lines=None if recording.lines is None else recording.lines[first],
+    )
