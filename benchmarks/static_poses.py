@@ -22,7 +22,8 @@ import numpy as np
 from timing import print_table
 
 import dvrk_drake as dvrk
-from dvrk_drake.analysis.pose_identification import MIN_TORQUE, identify_static
+from dvrk_drake.analysis.estimation.pose_effects import MIN_TORQUE
+from dvrk_drake.analysis.pose_identification import identify_static
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, joint_row, position_along
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.models.approach import approach_offset, offset_pose

@@ -65,6 +65,19 @@ def test_package_imports_only_allowed_packages(package):
     assert not wrong, "\n".join(sorted(wrong))
 
 
+def test_folders_of_analysis_import_only_previous_folders():
+    folders = ["observations", "estimation", "excitation"]
+    wrong = [
+        f"{module} imports {name}"
+        for module, path in MODULES.items()
+        for k, folder in enumerate(folders)
+        if module.startswith(f"dvrk_drake.analysis.{folder}.")
+        for name in imports_of(path.read_text())
+        if name.startswith("dvrk_drake.analysis.") and name.split(".")[2] not in folders[: k + 1]
+    ]
+    assert not wrong, "\n".join(sorted(wrong))
+
+
 def test_no_two_modules_import_each_other():
     imports = {module: imports_of(path.read_text()) for module, path in MODULES.items()}
     # An imported name is a module, or belongs to one.

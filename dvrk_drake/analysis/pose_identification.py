@@ -10,7 +10,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.estimation.pose_effects import StaticProblem, select_effects
+from dvrk_drake.analysis.estimation.pose_effects import MIN_TORQUE, StaticProblem, select_effects
 from dvrk_drake.analysis.estimation.robust_fit import FOLDS, blocks, rms, weighted_fit
 from dvrk_drake.analysis.observations.excluded_measurements import (
     ExcludedMeasurement,
@@ -35,10 +35,9 @@ from dvrk_drake.recordings.recording import Recording
 
 Method = Literal["robust", "paper"]
 
-#: Condition for the feedforward of a joint with a small torque. The torque is small if its RMS value, as a share of the
-#: effort limit, is below the first number. The ratio of the leave-one-out error to the RMS torque must then not exceed
-#: the second number.
-MIN_TORQUE, MAX_SMALL_TORQUE_RATIO = 0.02, 0.5
+#: Largest ratio of the leave-one-out error to the RMS torque for the feedforward of a joint with a small torque
+#: (`MIN_TORQUE`).
+MAX_SMALL_TORQUE_RATIO = 0.5
 #: Smallest range of the recorded positions of a joint with a feedforward, as a share of the range between the joint
 #: limits. With a smaller range, most predicted torques would be extrapolated.
 MIN_MOTION = 0.02
@@ -231,13 +230,19 @@ def _statistics(
     statistics = []
     for j, name in enumerate(arm.joint_names):
         lower, upper = float(recording.q[:, j].min()), float(recording.q[:, j].max())
-        columns = [values[:, j] for values in (recording.measured_effort(), *errors)]
+        use = usable[:, j]
+        torque, fitted, leave_one_out, held_out = (x[:, j] for x in (recording.measured_effort(), *errors))
         statistics.append(
             JointStatistics(
-                name,
-                *(rms(column) for column in columns[:3]),
-                *(rms(column[usable[:, j]]) for column in columns),
-                num_excluded=int(np.sum(~usable[:, j])),
+                name=name,
+                rms_zero_torque=rms(torque),
+                rms_fit=rms(fitted),
+                rms_leave_one_out=rms(leave_one_out),
+                rms_zero_torque_included=rms(torque[use]),
+                rms_fit_included=rms(fitted[use]),
+                rms_leave_one_out_included=rms(leave_one_out[use]),
+                rms_cross_validation_included=rms(held_out[use]),
+                num_excluded=int(np.sum(~use)),
                 feedforward_scale=float(feedforward_scale[j]),
                 position_lower=lower,
                 position_upper=upper,

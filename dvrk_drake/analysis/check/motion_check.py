@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,10 +96,10 @@ def check_motion(report: RecordingReport, observations: Observations) -> tuple[R
     statistics |= {"speed": speed, "acceleration": acceleration, "work": work}
     if agreement is not None:
         statistics |= {"velocity_gain": agreement.gain, "velocity_lag": agreement.lag}
-    joints = [
-        replace(joint, **{name: float(values[j]) for name, values in statistics.items()})
-        for j, joint in enumerate(report.joints)
-    ]
+    joints = list(report.joints)
+    for j, joint in enumerate(joints):
+        own: dict[str, Any] = {name: float(values[j]) for name, values in statistics.items()}
+        joints[j] = replace(joint, **own)
     for j in np.flatnonzero(lags.determined):
         joints[j] = replace(joints[j], effort_lag=float(lags.lag[j]))
     cut_off = None if period is None else arm.identification.effort_cut_off

@@ -27,6 +27,8 @@ BASE_PRIOR = 0.25
 #: The value for offsets is small: over a narrow range of positions, a large offset would replace gravity in the fit,
 #: and the model would be wrong outside this range.
 EFFECT_PRIOR = {"offset": 0.03, "cable sine": 0.3, "cable cosine": 0.3, "spring": 0.3}
+#: RMS torque below which a torque is small, as a share of the effort limit.
+MIN_TORQUE = 0.02
 #: Smallest standard deviation of a torque measurement, as a share of the effort limit.
 SIGMA_FLOOR = 2e-3
 #: Smallest reduction of the sum of squared leave-one-out residuals [sigma^2] by an added effect, per coefficient. The
