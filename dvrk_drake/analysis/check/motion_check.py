@@ -100,8 +100,8 @@ def check_motion(report: RecordingReport, observations: Observations) -> tuple[R
     for j, joint in enumerate(joints):
         own: dict[str, Any] = {name: float(values[j]) for name, values in statistics.items()}
         joints[j] = replace(joint, **own)
-    for j in np.flatnonzero(lags.determined):
-        joints[j] = replace(joints[j], effort_lag=float(lags.lag[j]))
+    for late in np.flatnonzero(lags.determined):
+        joints[late] = replace(joints[late], effort_lag=float(lags.lag[late]))
     cut_off = None if period is None else arm.identification.effort_cut_off
     return replace(report, joints=tuple(joints), period=period, floor_cut_off=cut_off), findings + more
 
