@@ -474,10 +474,6 @@ def _nominal_dynamics(arm: Arm) -> DynamicSection:
         links=[LinkEstimate(link.link, link.parameters.tolist()) for link in regressor.links],
         rotors=[RotorEstimate(name, rotor.value) for name, rotor in zip(arm.joint_names, rotors, strict=True)],
         effects=[DriveEffect(e.coordinate, e.kind, e.scale, e.coefficient) for e in drive],
-        signals=SignalSettings(
-            acceleration_cut_off=list(arm.identification.acceleration_cut_off),
-            effort_cut_off=arm.identification.effort_cut_off,
-            effort_delay=list(arm.identification.effort_delay),
-        ),
+        signals=SignalSettings.of(arm.identification),
         gravity_expected=gravity,
     )

@@ -48,7 +48,7 @@ class Observations:
             clocks: True times of the segments between gaps, if they are known, see `true_time`.
         """
         self.recording, self.arm = recording, arm
-        self.settings = settings or default_settings(arm)
+        self.settings = settings or SignalSettings.of(arm.identification)
         self._known_clocks = clocks
 
     @classmethod
@@ -258,13 +258,3 @@ class Poses(NamedTuple):
     def recording(self) -> Recording:
         """Recording of `observations`."""
         return self.observations.recording
-
-
-def default_settings(arm: Arm) -> SignalSettings:
-    """Returns the signal settings of the arm file."""
-    motion = arm.identification
-    return SignalSettings(
-        acceleration_cut_off=list(motion.acceleration_cut_off),
-        effort_cut_off=motion.effort_cut_off,
-        effort_delay=list(motion.effort_delay),
-    )
