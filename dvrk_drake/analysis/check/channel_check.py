@@ -230,15 +230,21 @@ def _merge_segments(segments: list[tuple[_WithNote, _WithNote]], count: int, arm
 
 def _notes(arm: Arm, uncertain: list[int], undetectable: list[int]) -> Iterator[Finding]:
     """Yields notes on joints with an uncertain effort scale, and on joints with an undetectable position offset."""
-    names = ", ".join(arm.joint_names[i] for i in uncertain)
-    what = "the friction differs from the arm file, so an effort scale of 0.5 or 2 cannot be excluded"
-    advice = "Usual cause: friction varies from day to day. Check the torque constants if earlier recordings did not "
     if uncertain:
-        yield Finding("note", "uncertain effort scale", names, what, f"{advice}have this note.", tuple(uncertain))
-    names, (angle, length) = ", ".join(arm.joint_names[i] for i in undetectable), OFFSET_DEVIATION
-    what = f"position offsets of {angle} rad ({length} m) cannot be detected in this recording"
-    advice = "Such offsets have the same effect as different centres of mass of the links. Check the encoder offsets."
+        what = "the friction differs from the arm file, so an effort scale of 0.5 or 2 cannot be excluded"
+        advice = (
+            "Usual cause: friction varies from day to day. Check the torque constants if earlier recordings did not "
+            "have this note."
+        )
+        names = ", ".join(arm.joint_names[i] for i in uncertain)
+        yield Finding("note", "uncertain effort scale", names, what, advice, tuple(uncertain))
     if undetectable:
+        angle, length = OFFSET_DEVIATION
+        what = f"position offsets of {angle} rad ({length} m) cannot be detected in this recording"
+        advice = (
+            "Such offsets have the same effect as different centres of mass of the links. Check the encoder offsets."
+        )
+        names = ", ".join(arm.joint_names[i] for i in undetectable)
         yield Finding("note", "undetectable offset", names, what, advice, tuple(undetectable))
 
 
