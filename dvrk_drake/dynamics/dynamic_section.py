@@ -3,7 +3,7 @@
 # This file has no postponed annotations, because yaml_load_typed reads the types at run time.
 from dataclasses import dataclass, field
 
-from dvrk_drake.models.arm_schema import GRAVITIES, MotionSettings
+from dvrk_drake.models.arm_schema import GRAVITIES, IdentificationSettings
 from dvrk_drake.models.effects_schema import FREEDOMS, DriveEffect
 from dvrk_drake.models.ranges import within
 
@@ -101,7 +101,7 @@ class SignalSettings:
     effort_delay: list[float] = field(default_factory=list, metadata=within(-1.0, 1.0, "s"))
 
     @classmethod
-    def of(cls, motion: MotionSettings) -> "SignalSettings":
+    def of(cls, motion: IdentificationSettings) -> "SignalSettings":
         """Returns the settings of an arm file."""
         return cls(
             acceleration_cut_off=list(motion.acceleration_cut_off),

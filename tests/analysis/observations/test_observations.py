@@ -43,8 +43,9 @@ def test_a_recording_is_prepared_once(calls, monkeypatch):
         raise PreparedError
 
     # Hypotheses about exchanged and inverted channels are other recordings. The other two only need time.
-    for name in ("_hypotheses", "_scales", "_offsets"):
-        monkeypatch.setattr(f"dvrk_drake.analysis.check.channel_check.{name}", lambda *_: [])
+    monkeypatch.setattr("dvrk_drake.analysis.check.channel_check._hypotheses", lambda *_: [])
+    for name in ("_scales", "_offsets"):
+        monkeypatch.setattr(f"dvrk_drake.analysis.check.channel_check.{name}", lambda *_: ([], set()))
     monkeypatch.setattr("dvrk_drake.analysis.motion_identification.dynamic_columns", stop)
     with pytest.raises(PreparedError):
         dvrk.identify(recording, arm)
