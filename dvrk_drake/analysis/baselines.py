@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.dynamic.dynamic_identification import DynamicIdentification
-from dvrk_drake.analysis.dynamic.validation import DynamicValidation, filtered_efforts
+from dvrk_drake.analysis.motion_identification import DynamicIdentification
+from dvrk_drake.analysis.motion_validation import DynamicValidation, filtered_efforts
+from dvrk_drake.analysis.pose_validation import predict_static
 from dvrk_drake.analysis.results import Identification, Validation
-from dvrk_drake.analysis.static.validation import predict_static
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ModelError
 

@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, is_prismatic, joint_row, position_along
-from dvrk_drake.dynamics.drive_curves import depends_on_position, friction_curve, position_curve
+from dvrk_drake.dynamics.drive_curves import friction_curve, position_curve
 from dvrk_drake.dynamics.dynamic_model import effect_shapes
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.effect_kinds import POSITION_KINDS
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.reports.colours import FITTED, MEASURED
 from dvrk_drake.reports.efforts import Efforts
@@ -46,7 +47,7 @@ def drive_plots(efforts: Efforts) -> list[Plot]:
 
 def _friction(efforts: Efforts) -> Plot | None:
     model, arm, grid = efforts.model.dynamic_model, efforts.arm, efforts.grid
-    effects = [e for e in model.section.effects if not depends_on_position(e)]
+    effects = [e for e in model.section.effects if e.kind not in POSITION_KINDS]
     if not effects or grid is None or efforts.v is None:
         return None
     transmitted = model.transmitted_effort(grid.q, grid.v, grid.vd)
@@ -77,7 +78,7 @@ def _friction(efforts: Efforts) -> Plot | None:
 def _torque(
     arm: Arm, effects: Sequence[DriveEffect], q: NDArray[np.float64], residuals: NDArray[np.float64]
 ) -> Plot | None:
-    own = [e for e in effects if depends_on_position(e)]
+    own = [e for e in effects if e.kind in POSITION_KINDS]
     panels = []
     for name in dict.fromkeys(e.coordinate for e in own if e.kind != "offset"):
         x = position_along(arm, name, q)

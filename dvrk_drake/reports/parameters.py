@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dvrk_drake.analysis.dynamic.estimates import MIN_IDENTIFIABILITY
+from dvrk_drake.analysis.estimation.motion_estimates import MIN_IDENTIFIABILITY
 from dvrk_drake.dynamics.actuator_effects import is_prismatic
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor, derive_base_parameters
 from dvrk_drake.dynamics.dynamic_section import DynamicSection

@@ -10,7 +10,7 @@ from report_checks import check_report
 
 import dvrk_drake as dvrk
 from dvrk_drake.analysis.baselines import baseline_efforts
-from dvrk_drake.analysis.static.static_identification import identify_static
+from dvrk_drake.analysis.pose_identification import identify_static
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.models.effects_schema import half_width
