@@ -88,7 +88,8 @@ def teach(
     event = "Enter or one second of rest" if at_rest else "Enter"
     print(f"{event} adds a pose, Ctrl-C ends", flush=True)
     try:
-        count = connection.teach(poses, at_rest=at_rest)
+        with interrupt_ends_process():
+            count = connection.teach(poses, at_rest=at_rest)
     finally:
         line.clear()
     print_written(poses, f"{count} poses; the guard of {connection.arm.name} regulates the pose")
@@ -132,7 +133,8 @@ def collect_poses(
         settings = CollectionSettings(traverse_time, both_sides, **given)
         connection, line = _connect(controlled, keys=controlled.is_ros, confirms=controlled.is_ros and not yes)
     try:
-        collector = connection.collect_poses(poses, output, settings)
+        with interrupt_ends_process():
+            collector = connection.collect_poses(poses, output, settings)
     finally:
         line.clear()
     if collector is None:
@@ -177,7 +179,8 @@ def collect_motion(
     with interrupt_ends_process():
         connection, line = _connect(controlled, keys=True)
     try:
-        played = connection.play(motion, output)
+        with interrupt_ends_process():
+            played = connection.play(motion, output)
     finally:
         line.clear()
     if played.path is not None:
@@ -213,17 +216,17 @@ def _connect(controlled: ControlledArm, *, keys: bool, confirms: bool = False) -
     """
     from dvrk_drake.processes.connection import Dialog
     from dvrk_drake.processes.live_status import LiveLine
-    from dvrk_drake.processes.simulated_arm import stop_on_signals
     from dvrk_drake.processes.teacher import EnterKey
 
-    stopped, line = stop_on_signals(), LiveLine(sys.stderr)
+    line = LiveLine(sys.stderr)
     has_keys = keys and sys.stdin is not None and sys.stdin.isatty()
     enter = EnterKey(sys.stdin) if has_keys else None
 
     def confirm() -> None:
         if confirms and enter is not None:
             print("Clear the workspace of the arm. Enter starts the motion, Ctrl-C ends the command.", flush=True)
-            while not stopped() and not enter():
+            while not connection.dialog.stopped() and not enter():
                 time.sleep(0.02)
 
-    return connect_arm(controlled, Dialog(stopped, confirm, enter, line.report, line.show)), line
+    connection = connect_arm(controlled, Dialog(confirm=confirm, enter=enter, report=line.report, show=line.show))
+    return connection, line

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from contextlib import closing, contextmanager, suppress
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 from cyclopts import Parameter
@@ -19,7 +20,7 @@ from dvrk_drake.cli.support import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from dvrk_drake.models.arm_schema import Gains
     from dvrk_drake.processes.connection import ArmConnection, Dialog
@@ -65,14 +66,12 @@ def control(
     """
     from dvrk_drake.processes.connection import Dialog
     from dvrk_drake.processes.live_status import LiveLine, LiveStatus
-    from dvrk_drake.processes.simulated_arm import stop_on_signals
 
     controlled.check(lcm={"reset": controlled.reset})
     with interrupt_ends_process():
         compensator = _friction_compensator(controlled, mode, friction_ratio, hysteresis_ratio, friction_model)
         checked_gains = None if gains is None else _gains(gains, mode, controlled.arm)
-        stopped = stop_on_signals()
-        connection = connect_arm(controlled, Dialog(stopped, report=lambda line: print(line, flush=True)))
+        connection = connect_arm(controlled, Dialog(report=lambda line: print(line, flush=True)))
     name = connection.arm.name
     line, printed = LiveLine(sys.stderr), [("", "")]
 
@@ -85,7 +84,8 @@ def control(
         print(status, flush=True)
 
     try:
-        connection.run(mode, gains=checked_gains, friction=compensator, report=show)
+        with interrupt_ends_process():
+            connection.run(mode, gains=checked_gains, friction=compensator, report=show)
     finally:
         line.clear()
     print(f"control ended; the guard of {name} regulates the pose", flush=True)
@@ -211,13 +211,21 @@ def _friction_compensator(
 
 
 def connect_arm(controlled: ControlledArm, dialog: Dialog) -> ArmConnection:
-    """Returns the connection to the arm that the options of a command define."""
+    """Returns the connection to the arm that the options of a command define.
+
+    Use the connection within `interrupt_ends_process`. Ctrl-C then ends the process at once, until this process
+    commands the arm. From then on, `dialog.stopped` returns true after Ctrl-C.
+    """
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.processes.connection import connect, model_warning
     from dvrk_drake.processes.pace import settle_memory
+    from dvrk_drake.processes.simulated_arm import stop_on_signals
+
+    handlers: list[Callable[[], bool]] = []
 
     def ready() -> None:
+        handlers.append(stop_on_signals())
         settle_memory()
         request_realtime(controlled.realtime)
 
@@ -236,6 +244,6 @@ def connect_arm(controlled: ControlledArm, dialog: Dialog) -> ArmConnection:
         topic=getattr(controlled, "topic", None),
         domain=getattr(controlled, "domain", None),
         reset=controlled.reset,
-        dialog=dialog,
+        dialog=replace(dialog, stopped=lambda: any(handler() for handler in handlers)),
         ready=ready,
     )

@@ -304,6 +304,7 @@ class ArmConnection:
         else:
             from dvrk_drake.systems.ros.crtk_move_link import connect_move_link
 
+            self.ready()
             model, ros = ControlModel(self.model), open_ros_domain(self.domain)
             try:
                 moved = connect_move_link(
@@ -533,7 +534,8 @@ def connect(
         guard: Settings of the command guard over ROS 2. None: the defaults. Over LCM, the process of the arm has the
             guard.
         dialog: Functions for the communication with the operator. None: there is none, and a motion runs to its end.
-        ready: Function that is called before the control begins, e.g. to request real-time scheduling.
+        ready: Function that is called before this process commands the arm, e.g. to handle signals and to request
+            real-time scheduling. Over ROS 2, it is called before the connection.
 
     Raises:
         ModelError: The model cannot be read, or belongs to another arm.

@@ -52,8 +52,8 @@ class EffortRamp(LeafSystem):
         self._wanted = self.DeclareVectorInputPort("effort_wanted", num_joints)
         self._measured = self.DeclareVectorInputPort("effort_measured", num_joints)
         self._enabled = self.DeclareVectorInputPort("enabled", 1)
-        self._start = self.DeclareDiscreteState(num_joints)
-        self._share = self.DeclareDiscreteState(1)
+        self._start = int(self.DeclareDiscreteState(num_joints))
+        self._share = int(self.DeclareDiscreteState(1))
         self.DeclareVectorOutputPort("effort", num_joints, self._calc_effort)
         self.DeclareInitializationDiscreteUpdateEvent(self._update)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
@@ -61,15 +61,17 @@ class EffortRamp(LeafSystem):
 
     def GetShare(self, context: Context) -> float:
         """Returns the completed share of the ramp, 0..1."""
-        return float(context.get_discrete_state(int(self._share)).get_value()[0])
+        return float(context.get_discrete_state(self._share).value()[0])
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
         if self._enabled.Eval(context)[0]:
-            state.set_value(int(self._share), [min(1.0, self.GetShare(context) + self._increment)])
+            state.set_value(self._share, [min(1.0, self.GetShare(context) + self._increment)])
         else:
-            state.set_value(int(self._share), [0.0])
-            state.set_value(int(self._start), self._measured.Eval(context))
+            state.set_value(self._share, [0.0])
+            state.set_value(self._start, self._measured.Eval(context))
 
     def _calc_effort(self, context: Context, output: BasicVector) -> None:
-        start = context.get_discrete_state(int(self._start)).get_value()
-        output.SetFromVector(start + self.GetShare(context) * (self._wanted.Eval(context) - start))
+        start = context.get_discrete_state(self._start).value()
+        share = self.GetShare(context)
+        wanted = self._wanted.Eval(context)
+        output.SetFromVector(wanted if share >= 1.0 else start + share * (wanted - start))

@@ -20,7 +20,7 @@ from dvrk_drake.dynamics.static_model import static_model
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.sdf_model import MODELS_FOLDER
-from dvrk_drake.processes import arm_controller, control, simulated_arm
+from dvrk_drake.processes import connection, simulated_arm
 from dvrk_drake.recordings.pose_file import save_poses
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import Recording
@@ -371,8 +371,8 @@ def test_interrupt_is_not_lost_in_extension_modules(command, tmp_path, monkeypat
             signal.sigtimedwait([], 0)  # lets Python call the handler
         sys.exit("the interrupt was lost")
 
-    monkeypatch.setattr(control, "first_status", lambda link: (lcmt_dvrk_status(), 1e-3))
-    monkeypatch.setattr(arm_controller, "ArmController", calls_extension_module)
+    monkeypatch.setattr(connection, "first_status", lambda link: (lcmt_dvrk_status(), 1e-3))
+    monkeypatch.setattr(connection, "ArmController", calls_extension_module)
     monkeypatch.setattr(simulated_arm, "SimulatedArm", calls_extension_module)
     monkeypatch.setattr(sys, "argv", ["dvrk-drake", *words, "--arm", "mtml", "--lcm-url", "memq://"])
     code, printed = forked_program(main)

@@ -23,6 +23,7 @@ def simulated(monkeypatch):
     what = SimpleNamespace(stopped=lambda sticky: False, off_at=None, arms=[])
 
     def start(connection, mode):
+        connection.ready()
         controller = ArmController(arm, IdentifiedModel.from_arm(arm), mode, PERIOD)
         what.arms.append(StickyArm(arm, IdentifiedModel.from_arm(arm), np.zeros(7), near_poses()[0]))
         opened = SimpleNamespace(next_status=lambda _: what.arms[-1].status(), close=lambda: None)
