@@ -18,7 +18,6 @@ from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm, checked_gravity
 from dvrk_drake.models.arm_schema import (
     ArmDescription,
-    CoupledLimit,
     Frames,
     Gains,
     IdentificationSettings,
@@ -261,10 +260,17 @@ def _build_arm(
     if missing := set(joints) - set(facts.joint_names):
         raise ArmError(f"{path}: the SDF has no joint {', '.join(sorted(missing))}")
     if unlimited := [j for j in joints if j not in position_limits]:
-        raise ArmError(f"{path}: joint {unlimited[0]} of the model has no position limits; state position_limits")
-    limits = np.array([_lower_and_upper(path, f"position_limits.{j}", position_limits[j]) for j in joints])
+        raise ArmError(
+            f"{path}: joint {unlimited[0]} needs position limits [rad, m]: state them in the model, or under "
+            "position_limits of an arm file"
+        )
+    if wrong := [j for j in joints if len(position_limits[j]) != 2]:
+        raise ArmError(f"{path}: position_limits.{wrong[0]} is {position_limits[wrong[0]]}; allowed: [lower, upper]")
+    limits = np.array([position_limits[j] for j in joints])
     for j in description.position_limits.keys() & description.position_offsets.keys():
         limits[joints.index(j)] += description.position_offsets[j]
+    for limit in mechanism.coupled_limits:
+        _row(path, f"coupled_limits.{limit.name}", limit.coefficients, mechanism.joints)
     effort_limits = _effort_limits(path, joints, facts.effort_limits | description.effort_limits)
     has_gains = not mechanism.joints or any(vars(mechanism.gains).values())
     joined = {k: getattr(mechanism.gains, k) + getattr(instrument.gains, k) for k in ("kp", "kd", "ki")}
@@ -285,7 +291,7 @@ def _build_arm(
         position_upper=limits[:, 1],
         effort_limits=effort_limits,
         prismatic=np.array([j in facts.prismatic for j in joints]),
-        coupled_limits=_coupled_limits(path, description, mechanism),
+        coupled_limits=tuple(mechanism.coupled_limits),
         linkage=LinearMap(G, c),
         transmission=LinearMap(_transmission(path, joints, mechanism, instrument), np.zeros(len(joints))),
         loop_closures=tuple(mechanism.loop_closures),
@@ -354,24 +360,6 @@ def _identification_settings(path: Path, mechanism: Mechanism, instrument: Instr
         effort_cut_off=mechanism.effort_cut_off,
         bounding_shapes=tuple(part.bounding_shapes for part in (mechanism, instrument) if part.sdf),
     )
-
-
-def _lower_and_upper(path: Path, key: str, limits: list[float]) -> list[float]:
-    if len(limits) != 2:
-        raise ArmError(f"{path}: {key} is {limits}; allowed: [lower, upper]")
-    return limits
-
-
-def _coupled_limits(path: Path, description: ArmDescription, mechanism: Mechanism) -> tuple[CoupledLimit, ...]:
-    limits = {limit.name: limit for limit in mechanism.coupled_limits}
-    for limit in mechanism.coupled_limits:
-        _row(path, f"coupled_limits.{limit.name}", limit.coefficients, mechanism.joints)
-    for name, bounds in description.coupled_limit_bounds.items():
-        if name not in limits:
-            raise ArmError(f'{path}: unknown coupled limit "{name}"; known: {", ".join(limits) or "none"}')
-        lower, upper = _lower_and_upper(path, f"coupled_limit_bounds.{name}", bounds)
-        limits[name] = dataclasses.replace(limits[name], lower=lower, upper=upper)
-    return tuple(limits.values())
 
 
 def _checked_effects(path: Path, effects: ArmEffects, joints: list[str]) -> ArmEffects:

@@ -161,7 +161,22 @@ class Frames(Shared):
 
 
 @dataclass
-class Mechanism:
+class _Part:
+    """Keys of mechanisms and instruments. `joints` are the independent joints, in the order of recordings."""
+
+    format: str = ""
+    sdf: str = ""
+    joints: list[str] = field(default_factory=list)
+    gains: Gains = field(default_factory=Gains)
+    motion: MotionSettings = field(default_factory=MotionSettings)
+    bounding_shapes: BoundingShapes = field(default_factory=BoundingShapes)
+    effects: ArmEffects = field(default_factory=ArmEffects)
+    frames: Frames = field(default_factory=Frames)
+    view: ViewSettings = field(default_factory=ViewSettings)
+
+
+@dataclass
+class Mechanism(_Part):
     """Schema of `mechanisms/*.yaml`: properties that all arms of one type share.
 
     `transmission` maps an actuator to the coefficients of its position: actuator position = sum of coefficient * joint
@@ -174,24 +189,16 @@ class Mechanism:
     """
 
     format: str = "dvrk_drake mechanism 1.0"
-    sdf: str = ""
-    joints: list[str] = field(default_factory=list)
-    gains: Gains = field(default_factory=Gains)
     published_gains: Gains = field(default_factory=Gains)
     transmission: dict[str, dict[str, float]] = field(default_factory=dict, metadata=COUPLINGS)
     coupled_limits: list[CoupledLimit] = field(default_factory=list)
     loop_closures: list[LoopClosure] = field(default_factory=list)
-    motion: MotionSettings = field(default_factory=MotionSettings)
     effort_cut_off: float = field(default=10.0, metadata=_CUT_OFFS)
-    bounding_shapes: BoundingShapes = field(default_factory=BoundingShapes)
-    effects: ArmEffects = field(default_factory=ArmEffects)
     console_gravity_compensation: bool = False
-    frames: Frames = field(default_factory=Frames)
-    view: ViewSettings = field(default_factory=ViewSettings)
 
 
 @dataclass
-class Instrument:
+class Instrument(_Part):
     """Schema of `instruments/*.yaml`: an exchangeable instrument. Its joints follow the joints of the mechanism.
 
     `joint_from_actuator` is the disc coupling as defined by the dVRK: joint position = sum of coefficient * actuator
@@ -202,18 +209,10 @@ class Instrument:
     """
 
     format: str = "dvrk_drake instrument 1.0"
-    sdf: str = ""
-    joints: list[str] = field(default_factory=list)
     separate_joint: str = ""
     joint_from_actuator: dict[str, dict[str, float]] = field(default_factory=dict, metadata=COUPLINGS)
     position_limits: dict[str, list[float]] = field(default_factory=dict, metadata=_POSITIONS)
-    gains: Gains = field(default_factory=Gains)
     friction_coordinates: dict[str, dict[str, float]] = field(default_factory=dict, metadata=COUPLINGS)
-    motion: MotionSettings = field(default_factory=MotionSettings)
-    bounding_shapes: BoundingShapes = field(default_factory=BoundingShapes)
-    effects: ArmEffects = field(default_factory=ArmEffects)
-    frames: Frames = field(default_factory=Frames)
-    view: ViewSettings = field(default_factory=ViewSettings)
 
 
 @dataclass
@@ -226,9 +225,7 @@ class ArmDescription(Mechanism):
     Without `mechanism`, only `sdf` is required. `sdf` is the path of a model file relative to the folder of the file
     that states it. `gravity` is the gravity vector in the arm's base frame [m/s^2]. `position_limits` and
     `effort_limits` replace those of the model. `position_offsets` are the positions in the model at the recorded
-    positions 0; limits refer to recorded positions. `coupled_limit_bounds` maps the name of a coupled limit to its
-    [lower, upper] for this arm, e.g. after the calibration of a joint stop. These values replace the values of the
-    mechanism.
+    positions 0; limits refer to recorded positions.
     """
 
     format: str = "dvrk_drake arm 1.0"
@@ -237,7 +234,6 @@ class ArmDescription(Mechanism):
     instrument: str = ""
     position_limits: dict[str, list[float]] = field(default_factory=dict, metadata=_POSITIONS)
     effort_limits: dict[str, float] = field(default_factory=dict, metadata={RANGE: EFFORTS})
-    coupled_limit_bounds: dict[str, list[float]] = field(default_factory=dict, metadata=_POSITIONS)
     position_offsets: dict[str, float] = field(default_factory=dict, metadata=_POSITIONS)
     gravity: list[float] = field(default_factory=lambda: [0.0, 0.0, -9.81], metadata=GRAVITIES)
 

@@ -297,16 +297,18 @@ def test_commands_accept_an_arm_file(folder, tmp_path, capsys):
     """The arm file has a calibrated coupled limit. The model stores the path of the arm file."""
     text = (MODELS_FOLDER / "arms/mtmr.yaml").read_text().replace("name: MTMR", "name: OURS")
     arm_file = tmp_path / "ours.yaml"
-    arm_file.write_text(text + "coupled_limit_bounds:\n  parallelogram: [-0.22, 0.5]\n")
+    limit = "coupled_limits: [{name: p, coefficients: {shoulder_pitch: 1, elbow_pitch: 1}, lower: -0.22, upper: 0.5}]"
+    arm_file.write_text(text + limit)
     arm = load_arm(str(arm_file))
     assert (arm.coupled_limits[0].lower, arm.coupled_limits[0].upper) == (-0.22, 0.5)
     model = tmp_path / "model.yaml"
     assert main(["identify", f"{folder}/poses.csv", "--arm", str(arm_file), "--output", str(model)]) == 0
     assert main(["validate", f"{folder}/other.csv", "--model", str(model)]) == 0
     capsys.readouterr()
-    arm_file.write_text(text + "coupled_limit_bounds:\n  parallelogramm: [-0.22, 0.5]\n")
-    (tmp_path / "other.yaml").write_text(arm_file.read_text())
-    assert 'unknown coupled limit "parallelogramm"' in fails(capsys, "equations", "--arm", tmp_path / "other.yaml")
+    (tmp_path / "other.yaml").write_text(text + limit.replace("elbow_pitch", "elbow"))
+    assert 'coupled_limits.p: unknown joint "elbow"; allowed: outer_yaw' in fails(
+        capsys, "equations", "--arm", tmp_path / "other.yaml"
+    )
 
 
 def test_validate_writes_null_for_a_joint_without_effort(folder, tmp_path):

@@ -168,17 +168,19 @@ def test_gains_of_the_wrong_sign_are_refused(name, gain, tmp_path):
         load_arm(path)
 
 
-@pytest.mark.parametrize("key", ["position_limits.outer_yaw", "coupled_limit_bounds.parallelogram"])
-def test_limits_in_degrees_are_refused(key, tmp_path):
-    table, name = key.split(".")
+@pytest.mark.parametrize(
+    ("key", "limits"),
+    [
+        ("position_limits.outer_yaw", "position_limits: {outer_yaw: [-40, 65]}"),
+        ("coupled_limits.sum", "coupled_limits: [{name: sum, coefficients: {outer_yaw: 1}, lower: -40, upper: 65}]"),
+    ],
+)
+def test_limits_in_degrees_are_refused(key, limits, tmp_path):
     path = Path(own_arm(tmp_path, ("<!--.*?-->", "")))
-    content = yaml.safe_load(path.read_text())
-    content.setdefault(table, {})[name] = [-40, 65]
-    path.write_text(yaml.safe_dump(content))
-    where = key.replace("limit_bounds", "limits")
-    message = rf"own\.yaml: {where}\[0\] is -40; allowed: -12\.6\.\.12\.6 rad; is it in degrees\?"
+    path.write_text(path.read_text() + limits)
+    message = rf"own\.yaml: {key}\[0\] is -40; allowed: -12\.6\.\.12\.6 rad; is it in degrees\?"
     with pytest.raises(ArmError, match=message):
-        load_arm(str(path))
+        load_arm(path)
 
 
 @pytest.mark.parametrize("key", ["base_parameters[3].value", "joints[2].feedforward_scale", "joints[0].rms_fit"])

@@ -43,8 +43,8 @@ def test_the_files_themselves_are_read(tmp_path):
         ("arm", ("yaw: [", "yaw: [low, "), 'position_limits.yaw[0] is "low"; allowed: a number'),
         (
             "arm",
-            ("name: PSM", "name: PSM\ncoupled_limit_bounds: []"),
-            "coupled_limit_bounds is []; allowed: a mapping from names to",
+            ("name: PSM", "name: PSM\nposition_offsets: []"),
+            "position_offsets is []; allowed: a mapping from names to",
         ),
         (
             "mechanism",
@@ -69,7 +69,7 @@ def test_the_files_themselves_are_read(tmp_path):
         ("instrument", ("joints:", "joint:"), 'instrument.yaml: key "joint" is unknown; did you mean'),
         (
             "arm",
-            ("position_limits:", "position_limits: 3\ncoupled_limit_bounds:"),
+            ("position_limits:", "position_limits: 3\neffort_limits:"),
             "position_limits is 3; allowed: a mapping from",
         ),
         ("instrument", ("sdf:", "sdf: [\n"), "instrument.yaml:"),
