@@ -20,6 +20,7 @@ from dvrk_drake.analysis.observations.excluded_measurements import (
 )
 from dvrk_drake.analysis.observations.static_poses import usable_poses
 from dvrk_drake.analysis.results import Identification
+from dvrk_drake.analysis.verdict import LARGEST_RATIO
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.identified_model import (
     BaseParameterEstimate,
@@ -35,13 +36,11 @@ from dvrk_drake.recordings.recording import Recording
 
 Method = Literal["robust", "paper"]
 
-#: Largest ratio of the leave-one-out error to the RMS torque for the feedforward of a joint with a small torque
-#: (`MIN_TORQUE`).
-MAX_SMALL_TORQUE_RATIO = 0.5
 #: Smallest range of the recorded positions of a joint with a feedforward, as a share of the range between the joint
 #: limits. With a smaller range, most predicted torques would be extrapolated.
 MIN_MOTION = 0.02
-#: Largest ratio of the leave-one-out error to the RMS torque for a feedforward scale of 1.
+#: Largest ratio of the leave-one-out error to the RMS torque for a feedforward scale of 1. At this ratio, the model
+#: explains 4 % of the squared torque.
 MAX_ERROR_RATIO = 0.98
 
 
@@ -176,7 +175,7 @@ def _feedforward_scales(
     """Returns the feedforward scale (n,) of each joint.
 
     The scale is below 1 if the model is not better than zero torque. It is 0 if the joint hardly moves, or if its
-    torque is small and the leave-one-out error is large (`MAX_SMALL_TORQUE_RATIO`).
+    torque is small and the leave-one-out error is large (`LARGEST_RATIO`).
 
     Args:
         problem: Problem with the poses and torques.
@@ -191,7 +190,7 @@ def _feedforward_scales(
         measured, predicted = problem.tau[use, j], (problem.tau - leave_one_out)[use, j]
         ratio = rms(measured - predicted) / max(rms(measured), 1e-12)
         small = rms(measured) < MIN_TORQUE * arm.effort_limits[j]
-        if not np.any(use) or np.ptp(problem.q[use, j]) <= min_motion[j] or (small and ratio > MAX_SMALL_TORQUE_RATIO):
+        if not np.any(use) or np.ptp(problem.q[use, j]) <= min_motion[j] or (small and ratio > LARGEST_RATIO):
             feedforward_scale[j] = 0.0
         elif ratio > MAX_ERROR_RATIO:
             power = np.sum(predicted**2)

@@ -15,7 +15,8 @@ from dvrk_drake.recordings.recording import MAX_MOTION_STEP, Recording
 
 #: Largest number of poses at which efforts are compared with the gravity of the SDF model. It limits the time to 30 ms.
 MAX_COMPARED = 500
-#: Smallest RMS gravity effort of the SDF model for a check of the sign, as a share of the measured RMS effort.
+#: Smallest RMS gravity effort of the SDF model for a check of the sign, as a share of the measured RMS effort. With a
+#: smaller share, effects of the drive are the larger part of the effort.
 GRAVITY_SHARE = 0.5
 #: Gravity must also exceed the effects of the drive, because the torque of a cable can exceed a smaller gravity effort.
 #: The share of the effort limit is for effects that the arm file does not state. In joints of an MTM and a PSM, a

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.estimation.normal_equations import NonNegativeFit, NormalEquations, SquareSums
 
 #: Assumed relative error of the efforts before the first fit, and lower limit of the relative error of an actuator in
-#: the computation of its weight.
+#: the computation of its weight. Half or twice the first number, and half the second one, change the mean
+#: cross-validated errors of the public motions `mtm_one` and `psm_one` by at most 0.001 percentage points.
 ASSUMED_ERROR, MIN_ERROR = 0.1, 0.02
 #: Number of fits in which the variances of the errors are estimated. A fourth fit changes the errors of the public
 #: motions of two PSMs on other motions by less than 0.01 %.

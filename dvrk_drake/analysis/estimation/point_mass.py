@@ -21,7 +21,7 @@ from dvrk_drake.dynamics.inertial_parameters import PARAMETER_NAMES
 #: does not determine the side of the link on which the payload is.
 MAX_STANDARD_ERROR = 0.5
 #: Distances of the initial positions from the link's own centre of mass, as shares of the largest distance. The centre
-#: of mass is also an initial position.
+#: of mass is also an initial position. The payload is near the link or on a tool, and the best of all fits is used.
 _INITIAL_DISTANCES = (0.15, 0.4)
 #: Number of inertial parameters of a rigid body.
 _RIGID = len(PARAMETER_NAMES)

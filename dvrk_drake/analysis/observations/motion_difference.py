@@ -84,7 +84,8 @@ DRIFT = 0.06
 #: Number of linear segments of a position-dependent torque over an actuator's range. Many segments are necessary,
 #: because joint stops and cables have local effects.
 NUM_SEGMENTS = 8
-#: Correlation length of a position-dependent torque as a share of the range.
+#: Correlation length of a position-dependent torque as a share of the range: two of the linear segments. Torques of
+#: neighbouring knots then have a correlation of 0.88.
 CORRELATION_LENGTH = 0.25
 #: Number of columns of `changes` without prior: offset, dry friction and viscous friction.
 _NUM_WITHOUT_PRIOR = 3
