@@ -39,8 +39,8 @@ SAME_ERROR = 1.05
 #: Largest share of an RMS effort that is a rounding error. Files contain efforts with six digits or more. Two
 #: recordings whose efforts differ by less are the same, and a payload with a smaller effort does not load an actuator.
 ROUNDING = 1e-6
-#: Order of the autoregression that whitens the errors, and number of fits of the autoregression. It is the smallest order
-#: that can represent an oscillation. The second fit uses residuals of a fit that already weights the frequencies.
+#: Order of the autoregression that whitens the errors, and number of fits of the autoregression. It is the smallest
+#: order that can represent an oscillation. The second fit uses residuals of a fit that already weights the frequencies.
 AUTOREGRESSION_ORDER, NUM_WHITENING_ITERATIONS = 2, 2
 #: Number of random poses at which the reach of the arm is measured. For an MTM and a PSM, the result is within 1 % of
 #: that for 400 poses.
