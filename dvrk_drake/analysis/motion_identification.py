@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dvrk_drake.analysis.estimation.common_delay import common_delay
 from dvrk_drake.analysis.estimation.motion_columns import (
     DynamicColumns,
     RecordingEffect,
@@ -47,6 +48,7 @@ from dvrk_drake.dynamics.dynamic_section import (
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, JointStatistics, Provenance
 from dvrk_drake.errors import IdentificationError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_files import has_converted_model
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.recordings.recording import REST_SPEED, Recording
 
@@ -120,6 +122,9 @@ def identify_dynamic(
     springs, cables and asymmetric friction that the arm file lists. The friction model consists of viscous, smoothed
     Coulomb and presliding friction. Additional effects are selected by cross-validation over the phase of the motion.
 
+    If the links are those of a model file and no delay of the efforts is stated, one delay is estimated for all of them
+    (`common_delay`).
+
     The link parameters are physically consistent. For parameters that the recordings do not identify, the estimates
     are the values of the SDF (`consistent_parameters`). The direction of gravity is estimated if the arm file allows a
     base tilt. The cross-validated errors are prediction errors on held-out folds (`cross_validate`).
@@ -139,6 +144,11 @@ def identify_dynamic(
     arm, settings = observations[0].arm, observations[0].settings
     recordings = [own.recording for own in observations]
     problem = motion_problem(observations)
+    if has_converted_model(arm) and not any(settings.effort_delay):
+        settings = replace(settings, effort_delay=[common_delay(problem, observations)] * arm.num_joints)
+        if any(settings.effort_delay):
+            observations = [Observations(own.recording, arm, settings, own.clocks) for own in observations]
+            problem = motion_problem(observations)
     progress(0.2)
     selection = select_effects(problem, lambda share: progress(0.2 + 0.3 * share))
     selection, fit = selection.consistent()

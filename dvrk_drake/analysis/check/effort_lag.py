@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from dvrk_drake.analysis.estimation.common_delay import MIN_ERRORS, MIN_GAIN, minimiser
 from dvrk_drake.analysis.estimation.motion_columns import DIRECTION_WIDTH
 from dvrk_drake.analysis.observations.low_pass import low_pass
 from dvrk_drake.analysis.observations.motion_grid import MotionSignals, ends_of
@@ -25,10 +26,6 @@ NUM_SEGMENTS = 5
 #: log-likelihood of `ChannelFit`. More measurements do not average out model errors. It is that of one period (6.48 s)
 #: of the public motion `psm_one` below its cut-off frequency (16.96 Hz).
 NUM_INDEPENDENT = 220
-#: A delay is significant if two ratios exceed these numbers: the ratio of the residual variances without and with the
-#: delay, and the ratio of the delay to its standard error. Half or twice these values changes only notes on delays of
-#: the public recordings.
-MIN_GAIN, MIN_ERRORS = 1.12, 5.0
 
 
 class EffortLag(NamedTuple):
@@ -103,15 +100,6 @@ def _fit(tau: NDArray[np.float64], Q: NDArray[np.float64], inner: slice, rate: f
     shifted = np.column_stack([tau[inner.start + s : inner.stop + s : inner.step] for s in shifts])
     squares = (shifted - Q @ (Q.T @ shifted)) ** 2
     totals = np.sum(squares, axis=0)
-    lags = [_minimiser(shifts, np.sum(segment, axis=0)) for segment in np.array_split(squares, NUM_SEGMENTS)]
+    lags = [minimiser(shifts, np.sum(segment, axis=0)) for segment in np.array_split(squares, NUM_SEGMENTS)]
     error = float(np.std(lags, ddof=1)) / np.sqrt(NUM_SEGMENTS)
-    return _minimiser(shifts, totals) / rate, error / rate, float(totals[len(shifts) // 2] / np.min(totals))
-
-
-def _minimiser(x: NDArray[np.int_], values: NDArray[np.float64]) -> float:
-    """Returns the minimiser of a curve with given values at equidistant x, from parabolic interpolation."""
-    i = int(np.clip(np.argmin(values), 1, len(values) - 2))
-    before, minimum, after = values[i - 1 : i + 2]
-    curvature = before - 2 * minimum + after
-    offset = 0.5 * (before - after) / curvature if curvature > 0 else 0.0
-    return float(x[i] + np.clip(offset, -1, 1) * (x[1] - x[0]))
+    return minimiser(shifts, totals) / rate, error / rate, float(totals[len(shifts) // 2] / np.min(totals))

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.check.effort_lag import CUT_OFF, MAX_LAG, MIN_ERRORS, EffortLag, effort_lag
+from dvrk_drake.analysis.check.effort_lag import CUT_OFF, MAX_LAG, EffortLag, effort_lag
 from dvrk_drake.analysis.check.report import RecordingReport
+from dvrk_drake.analysis.estimation.common_delay import MIN_ERRORS
 from dvrk_drake.analysis.estimation.motion_estimates import STRONG_CORRELATION
 from dvrk_drake.analysis.observations.finding import Finding, Severity
 from dvrk_drake.analysis.observations.low_pass import resample

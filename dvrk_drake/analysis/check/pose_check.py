@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.check.effort_lag import MIN_ERRORS
+from dvrk_drake.analysis.estimation.common_delay import MIN_ERRORS
 from dvrk_drake.analysis.observations.excluded_measurements import find_excluded, usable_measurements
 from dvrk_drake.analysis.observations.finding import Finding
 from dvrk_drake.analysis.observations.static_poses import MIN_POSES, average_repeated_poses

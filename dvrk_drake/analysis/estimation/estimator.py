@@ -117,6 +117,11 @@ class Estimator:
             squares += [held_out.squared_errors(fit.solve(k)) for k in (None, *added)]
         return np.sqrt(squares / np.where(self._efforts > 0, self._efforts, np.inf))
 
+    def fold_errors(self, used: NDArray[np.int_]) -> NDArray[np.float64]:
+        """Returns the sums (folds, s, n) of squared errors of each fold, predicted from the other folds."""
+        fits = ((held_out, self.fit_to(x.weighted(self.weights), used).solve()) for x, held_out in self._folds)
+        return np.array([held_out.squared_errors(x) for held_out, x in fits])
+
     @cached_property
     def _folds(self) -> list[tuple[SquareSums, SquareSums]]:
         """Sums of the training rows and of the held-out rows of each fold."""

@@ -32,8 +32,8 @@ HARMONIC_SHARE = 0.1
 #: changes the mean error of two motions of an MTM by 0.03 percentage points, and that of a PSM by -0.2 and +0.4.
 RECORDING_DEVIATION = 0.02
 #: Prior standard deviation of the torque of one presliding element, as a share of the RMS friction, if the friction is
-#: known. With a share of 0.3, an element with a long travel replaces part of the gravity of a joint whose effort is
-#: mainly gravity. A share of 0.1 or 0.03 changes the errors of four robots in other motions by less than 1 %.
+#: known. With a share of 0.3, an element with a long travel replaces part of the gravity of a joint whose friction is
+#: much smaller than its gravity. Shares of 0.1 and 0.03 have errors of four robots that differ by less than 1 %.
 PRESLIDING_SHARE = 0.1
 #: Smallest information about a direction in parameter space, relative to the prior. Along directions with less
 #: information, the estimates are the values of the SDF. Half or twice the value changes the errors of the public
