@@ -2,13 +2,16 @@
 
 import numpy as np
 import pytest
+from pydrake.geometry import Mesh
 from pydrake.multibody.parsing import Parser
-from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
+from pydrake.systems.framework import DiagramBuilder
 from robot_file import URDF, write_robot
 
 from dvrk_drake.errors import ArmError
+from dvrk_drake.export.model_writer import write_model
 from dvrk_drake.models.arm_files import derived_arm_file, load_arm
-from dvrk_drake.models.plant import holding_torques, inverse_dynamics
+from dvrk_drake.models.plant import add_arm, arm_sdf, holding_torques, inverse_dynamics
 from dvrk_drake.models.sdf_model import compose_sdf
 
 MJCF = """<mujoco model="lever">
@@ -96,6 +99,20 @@ def test_sticks_show_a_model_without_shapes(crane):
     assert root.find("model/link/collision") is None
 
 
+def test_meshes_of_a_model_file_are_drawn_and_exported(tmp_path):
+    (tmp_path / "box.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+    arm = load_arm(write_robot(tmp_path, ("package://crane_description/meshes/no_such_file.obj", "box.obj")))
+    (uri,) = arm_sdf(arm).iter("uri")
+    assert uri.text == f"file://{tmp_path / 'box.obj'}"
+    plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), 1e-3)
+    add_arm(plant, arm)
+    inspector = scene_graph.model_inspector()
+    assert any(isinstance(inspector.GetShape(shape), Mesh) for shape in inspector.GetAllGeometryIds())
+    write_model(arm, [], tmp_path / "own.urdf", "a test", format="urdf")
+    assert (tmp_path / "own_meshes" / tmp_path.name / "box.obj").is_file()
+    assert load_arm(tmp_path / "own.urdf").joint_names == arm.joint_names
+
+
 def test_mjcf_is_read(tmp_path):
     path = write_robot(tmp_path, name="lever.xml", text=MJCF)
     arm, plant = load_arm(path), original_plant(path, MJCF)
@@ -108,8 +125,6 @@ def test_mjcf_is_read(tmp_path):
 
 
 def test_model_directives_and_sdf_are_read(crane, tmp_path):
-    from dvrk_drake.export.model_writer import write_model
-
     arm = load_arm(crane)
     write_model(arm, [], tmp_path / "own.sdf", "a test")
     (tmp_path / "package.xml").write_text("<package><name>here</name></package>")
