@@ -119,10 +119,6 @@ Overwrite = Annotated[
     bool, Parameter(show_default=False, help="Replace existing files, and write into folders that are not empty.")
 ]
 Verbose = Annotated[bool, Parameter(alias="-v", show_default=False, help="Print all details.")]
-Plots = Annotated[
-    str | None, Parameter(metavar="FOLDER", help="Write figures into this folder, which must be new or empty.")
-]
-Json = Annotated[str | None, Parameter(metavar="FILE", help="Write the results as JSON.")]
 Seed = Annotated[
     int,
     Parameter(converter=whole_number, validator=_check_seed, help="Seed of the random number generator, 0 or larger."),

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from dvrk_drake.cli.app import SIMULATE, Overwrite, Port, Seed, Verbose, app
-from dvrk_drake.cli.support import Steps, check_output, command_words, new_folder, print_written, quiet_drake
+from dvrk_drake.cli.support import Steps, check_output, command_words, new_folder, print_written
 from dvrk_drake.progress import step_progress
 
 _DEMO_STEPS = "collecting poses", "identifying", "collecting fresh poses", "simulating the release", "drawing"
@@ -35,7 +35,6 @@ def demo(
     from dvrk_drake.reports.provenance import Provenance
     from dvrk_drake.reports.terminal import make_console, print_page
 
-    quiet_drake()
     output = new_folder(folder, overwrite=overwrite)
     with Steps(*_DEMO_STEPS) as steps:
         result = run_demo(output, arm, seed, steps)
@@ -69,7 +68,6 @@ def teleop(
     from dvrk_drake.reports.terminal import make_console, print_page
     from dvrk_drake.systems.arm_view.page import page_html
 
-    quiet_drake()
     if output is None:
         meshcat = start_scene(port)
         print(
@@ -113,7 +111,6 @@ def reproduce(
     from dvrk_drake.reports.reproduction.run import reproduce as reproduce_paper
     from dvrk_drake.reports.terminal import make_console
 
-    quiet_drake()
     recordings = PaperRecordings.find(data)
     if what == "fig4":
         _ = recordings.poses  # rejects a missing recording before the folder is created

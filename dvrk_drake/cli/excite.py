@@ -22,7 +22,7 @@ from dvrk_drake.cli.app import (
     app,
     whole_number,
 )
-from dvrk_drake.cli.support import Steps, check_output, load_environment, mounted, print_written, quiet_drake
+from dvrk_drake.cli.support import Steps, check_output, load_environment, mounted, print_written
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.workers import local_executor
 
@@ -175,7 +175,6 @@ def _select_poses(
     limits = dvrk.MotionLimits(
         margin=MARGIN if margin is None else margin, effort=effort, positions=positions, environment=environment
     )
-    quiet_drake()
     arm = mounted(dvrk.load_arm(name), gravity, None)
     with Steps("selecting poses") as steps:
         design = dvrk.design_poses(arm, count, limits=limits, seed=seed, progress=steps)

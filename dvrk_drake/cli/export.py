@@ -8,14 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Group, Parameter
 
-from dvrk_drake.cli.app import Arm, Json, Model, Overwrite, Plots, Verbose, export, one_of
-from dvrk_drake.cli.report import Report, check_report, write_page
-from dvrk_drake.cli.support import Steps, check_output, load_model, plots_folder, print_written, write_json
+from dvrk_drake.cli.app import Arm, Model, Overwrite, Verbose, export, one_of
+from dvrk_drake.cli.report import ResultsAndJson
+from dvrk_drake.cli.support import Steps, check_output, load_model, print_warning, print_written
 from dvrk_drake.errors import DvrkDrakeError, ModelError
 
 if TYPE_CHECKING:
     from dvrk_drake.export.model_export import Format
 
+_RESULTS = ResultsAndJson()
 _SOURCE = one_of("Source (one is required)")
 _GRAVITY_COMPENSATION = Group("Options for --dvrk-gc (--gc-tolerance: also for --dvrk-kinematic-gc)")
 SourceArm = Annotated[
@@ -122,7 +123,7 @@ def export_model(
     if tilt := loaded.provenance.base_tilt:
         what = f"the base of the recorded arm seems to be tilted, but the model assumes that it is not ({tilt})"
         advice = "Identify again with --gravity before you use an exported file."
-        print(f"dvrk-drake: warning: {origin}: {what}. {advice}", file=sys.stderr, flush=True)
+        print_warning(f"{origin}: {what}. {advice}")
     if diff:
         loaded.arm.refuse_locked_joints("--diff")
         bodies = model_bodies(loaded)
@@ -136,11 +137,7 @@ def compare(
     *,
     model: SourceModel = None,
     arm: SourceArm = None,
-    json: Json = None,
-    plots: Plots = None,
-    report: Report = None,
-    overwrite: Overwrite = False,
-    verbose: Verbose = False,
+    results: ResultsAndJson = _RESULTS,
 ) -> None:
     """Compare a gravity-compensation file of the dVRK with a model.
 
@@ -152,12 +149,8 @@ def compare(
     from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation
     from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
     from dvrk_drake.reports.export import compensation_page
-    from dvrk_drake.reports.terminal import make_console, print_page
 
-    if json is not None:
-        check_output(json, file, model or "", overwrite=overwrite)
-    check_report(report, file, model or "", overwrite=overwrite)
-    folder = plots_folder(plots, overwrite=overwrite)
+    results.check(file, model)
     installed = GravityCompensationFile.load(file)
     loaded, origin = load_model(model, arm), model or arm or ""
     try:
@@ -165,12 +158,7 @@ def compare(
             comparison = compare_compensation(installed, loaded)
     except ModelError as error:
         raise ModelError(f"{file}: {error}") from error
-    if json is not None:
-        write_json(json, comparison.as_dict())
     page = compensation_page(comparison, file_name=file, model_name=origin)
-    print_page(make_console(), page, verbose=verbose)
     for warning in comparison.warnings:
-        print(f"dvrk-drake: warning: {file}: {warning}", file=sys.stderr, flush=True)
-    if json is not None:
-        print_written(json)
-    write_page(page, folder, report, file, *([model] if model else []))
+        print_warning(f"{file}: {warning}")
+    results.show(page, file, model, content=comparison.as_dict())

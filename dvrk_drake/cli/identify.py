@@ -13,18 +13,16 @@ from dvrk_drake.cli.app import (
     Arm,
     FileOptions,
     Gravity,
-    Json,
     Locked,
     Model,
     Overwrite,
-    Plots,
     Recording,
     Verbose,
     app,
     identify,
     one_of,
 )
-from dvrk_drake.cli.report import Report, check_report, write_page
+from dvrk_drake.cli.report import Json, Plots, Report, ResultsAndJson, check_report, write_page
 from dvrk_drake.cli.support import (
     Steps,
     check_output,
@@ -72,6 +70,7 @@ Compare = Annotated[
 ]
 NewModel = Annotated[str, Parameter(metavar="MODEL.yaml", help="Model file to write.")]
 _FILE = FileOptions()
+_RESULTS = ResultsAndJson()
 _STEPS = "reading", "checking the recording"
 _SOURCE = one_of("Source of the model (one is required)")
 
@@ -313,10 +312,7 @@ def payload(
     file: FileOptions = _FILE,
     gravity: Gravity = None,
     locked: Locked = None,
-    json: Json = None,
-    report: Report = None,
-    overwrite: Overwrite = False,
-    verbose: Verbose = False,
+    results: ResultsAndJson = _RESULTS,
 ) -> None:
     """Estimate the mass and centre of mass of a payload.
 
@@ -329,7 +325,6 @@ def payload(
         link: SDF link to which the payload is attached. Default: the link with the smallest cross-validated error.
     """
     from dvrk_drake.reports.payload import payload_page
-    from dvrk_drake.reports.terminal import make_console, print_page
 
     if model is not None and gravity is not None:
         raise ModelError("--gravity requires --arm; with --model, the gravity vector of the model is used")
@@ -340,9 +335,7 @@ def payload(
             "--arm requires two recordings, without and with the payload; with one recording, give --model"
         )
     paths = [recording] if loaded is None else [recording, loaded]
-    if json is not None:
-        check_output(json, *paths, overwrite=overwrite)
-    check_report(report, *paths, model or "", overwrite=overwrite)
+    results.check(*paths, model)
     identified = None if model is None else load_model(model, None)
     recorded_arm = mounted(dvrk.load_arm(arm or ""), gravity, locked) if identified is None else identified.arm
     with Steps(*_STEPS, *(["identifying"] if identified is None else []), "estimating") as steps:
@@ -351,12 +344,6 @@ def payload(
             print_notes(read.source, read.notes)
         reference = recordings[0] if loaded else None
         result = dvrk.payload(reference, recordings[-1], identified or recorded_arm, link, progress=steps)
-    if json is not None:
-        write_json(json, result.as_dicts())
-    console = make_console()
     page = payload_page(result, model_path=model)
-    print_page(console, page, verbose=verbose)
-    print_warnings(console, [warning for warning in result.warnings if warning.kind == "other link"])
-    if json is not None:
-        print_written(json)
-    write_page(page, None, report, *paths, *([model] if model else []))
+    warnings = [warning for warning in result.warnings if warning.kind == "other link"]
+    results.show(page, *paths, model, content=result.as_dicts(), warnings=warnings)

@@ -15,7 +15,6 @@ from dvrk_drake.cli.support import (
     load_key,
     print_warning,
     print_written,
-    quiet_drake,
     request_realtime,
 )
 
@@ -229,7 +228,6 @@ def connect_arm(controlled: ControlledArm, dialog: Dialog) -> ArmConnection:
         settle_memory()
         request_realtime(controlled.realtime)
 
-    quiet_drake()
     arm, model = load_arm(controlled.arm), None
     if controlled.model is not None:
         model = IdentifiedModel.load(controlled.model, arm)

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from dvrk_drake.cli.app import MODEL, Arm, Gravity, LcmUrl, Overwrite, Port, app
-from dvrk_drake.cli.support import Steps, check_output, mounted, print_written, quiet_drake, until_stopped
+from dvrk_drake.cli.support import Steps, check_output, mounted, print_written, until_stopped
 from dvrk_drake.errors import DvrkDrakeError
 
 
@@ -111,7 +111,6 @@ def view(
     from dvrk_drake.systems.lcm.arm_link import LcmArmLink
     from dvrk_drake.systems.lcm.lcm_network import open_lcm
 
-    quiet_drake()
     if lcm_url and not live:
         raise DvrkDrakeError("--lcm-url requires --live")
     shown = load_arm(arm)

@@ -12,27 +12,22 @@ from dvrk_drake.cli.app import (
     IDENTIFY,
     Arm,
     FileOptions,
-    Json,
     Locked,
     Model,
     Overwrite,
-    Plots,
     Recording,
-    Verbose,
     app,
     one_of,
 )
-from dvrk_drake.cli.report import write_page
+from dvrk_drake.cli.report import ResultsAndJson
 from dvrk_drake.cli.support import (
     Steps,
     check_output,
     load_model,
     mounted,
     new_folder,
-    plots_folder,
     print_notes,
     print_written,
-    write_json,
 )
 from dvrk_drake.errors import ModelError, RecordingError
 
@@ -41,6 +36,7 @@ if TYPE_CHECKING:
     from dvrk_drake.recordings.recording import Recording as LoadedRecording
 
 _FILE = FileOptions()
+_RESULTS = ResultsAndJson()
 _SOURCE = one_of("Arm or its model (one is required)")
 
 
@@ -72,10 +68,7 @@ def check(
     ] = None,
     file: FileOptions = _FILE,
     locked: Locked = None,
-    json: Json = None,
-    plots: Plots = None,
-    overwrite: Overwrite = False,
-    verbose: Verbose = False,
+    results: ResultsAndJson = _RESULTS,
 ) -> None:
     """Check a recording and report its problems.
 
@@ -83,21 +76,15 @@ def check(
     """
     from dvrk_drake.models.locked_joints import locked_option
     from dvrk_drake.reports.recording_check import check_page, has_spectra
-    from dvrk_drake.reports.terminal import make_console, print_page
 
     if model is not None and locked is not None:
         raise ModelError("--locked requires --arm; with --model, the locked joints of the model are used")
     identified = None if model is None else load_model(model, None)
     recorded_arm = mounted(dvrk.load_arm(arm or ""), None, locked) if identified is None else identified.arm
-    if json is not None:
-        check_output(json, recording, *([model] if model else []), overwrite=overwrite)
-    folder = plots_folder(plots, overwrite=overwrite)
+    results.check(recording, model)
     with Steps("reading", "checking the recording") as steps:
         checked = file.read(recording, recorded_arm, steps)
         report = dvrk.check(checked, identified or recorded_arm, progress=steps)
-    # Results are saved before printing, because the reader of the output (e.g. head) may close the pipe.
-    if json is not None:
-        write_json(json, report.as_dict())
     options = f"--arm {arm}{locked_option(recorded_arm)}" if model is None else f"--model {model}"
     other = _other_arm(checked, recorded_arm)
     page = check_page(
@@ -105,16 +92,12 @@ def check(
         source=options + file.as_text(),
         is_model=model is not None,
         other_arm=f"{other}{file.as_text()}" if other else "",
-        recording=None if folder is None else checked,
+        recording=None if results.plots is None else checked,
         arm=recorded_arm,
     )
-    print_page(make_console(), page, verbose=verbose)
-    if json is not None:
-        print_written(json)
-    if folder is not None and not has_spectra(report):
+    results.show(page, recording, model, content=report.as_dict())
+    if results.plots is not None and not has_spectra(report):
         print_notes(recording, ["no plots were written; spectra require a motion with efforts and time stamps"])
-    elif folder is not None:
-        write_page(page, folder, None)
     for refusal in report.refusals[1:]:
         print(f"dvrk-drake: {refusal}", file=sys.stderr)
     if report.refusals:

@@ -9,7 +9,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from dvrk_drake.cli.app import Arm, Gravity, Key, LcmUrl, Model, Realtime, RosDomain, RosTopic, bridge
-from dvrk_drake.cli.support import driver_configuration, interrupt_ends_process, mounted, quiet_drake, request_realtime
+from dvrk_drake.cli.support import driver_configuration, interrupt_ends_process, mounted, request_realtime
 from dvrk_drake.errors import ControllerError
 
 
@@ -50,7 +50,6 @@ def bridge_arm(
         settle_memory()
         request_realtime(realtime)
 
-    quiet_drake()
     domain_number(domain)  # rejects an invalid number before any other step
     with interrupt_ends_process():
         connected = mounted(load_arm(arm), gravity)

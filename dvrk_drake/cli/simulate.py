@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
 import dvrk_drake as dvrk
-from dvrk_drake.cli.app import Arm, FileOptions, Overwrite, Plots, Set, Verbose, one_of, simulate, whole_number
-from dvrk_drake.cli.report import Report, check_report, write_page
-from dvrk_drake.cli.support import Steps, check_output, plots_folder, print_written, quiet_drake, until_stopped
-from dvrk_drake.errors import ModelError, ScenarioError, StudyError
+from dvrk_drake.cli.app import Arm, FileOptions, Set, one_of, simulate, whole_number
+from dvrk_drake.cli.report import Results
+from dvrk_drake.cli.support import Steps, check_output, until_stopped
+from dvrk_drake.errors import ScenarioError, StudyError
 from dvrk_drake.progress import step_progress
 
-if TYPE_CHECKING:
-    from dvrk_drake.experiments.transparency import Compensation
-
 _FILE = FileOptions()
+_RESULTS = Results()
 _SCENARIO = one_of("Source (one is required)")
 _EXECUTOR = one_of("Computers (at most one option)", least=0)
 
@@ -33,10 +31,8 @@ def simulate_scenario(
     ] = None,
     set: Set = None,
     output: Annotated[str | None, Parameter(metavar="RECORDING")] = None,
-    plots: Plots = None,
     meshcat: Annotated[bool, Parameter(show_default=False)] = False,
-    overwrite: Overwrite = False,
-    verbose: Verbose = False,
+    results: Results = _RESULTS,
 ) -> None:
     """Simulate a controlled arm and record its motion.
 
@@ -47,16 +43,12 @@ def simulate_scenario(
     """
     from dvrk_drake.models.arm_files import known_arms
     from dvrk_drake.reports.simulation import simulation_page
-    from dvrk_drake.reports.terminal import make_console, print_page
 
-    quiet_drake()
     if scenario in known_arms():
         raise ScenarioError(f"{scenario} is an arm, not a scenario; use --arm {scenario}")
     source = arm or scenario or ""
     loaded = dvrk.load_scenario(source, set or [])
-    folder = plots_folder(plots, overwrite=overwrite)
-    if output is not None:
-        check_output(output, source, loaded.controller.model, overwrite=overwrite)
+    results.check(source, loaded.controller.model, output=output)
     page = dvrk.start_meshcat(loaded.mounted_arm) if meshcat else None
     if page is not None:
         from dvrk_drake.systems.arm_view.page import tracked_url
@@ -64,14 +56,11 @@ def simulate_scenario(
         print(f"{loaded.mounted_arm.name} at {tracked_url(page)}", flush=True)
     with Steps("simulating") as steps:
         simulation = dvrk.simulate(loaded, meshcat=page, progress=steps)
-    argument = (scenario or f"--arm {arm}") if folder is None else None
+    argument = (scenario or f"--arm {arm}") if results.plots is None else None
     if output is not None:
         dvrk.write_recording(simulation.recording, output, loaded.mounted_arm, simulation.setpoints)
     result = simulation_page(simulation, loaded.mounted_arm, scenario=argument)
-    print_page(make_console(), result, verbose=verbose)
-    if output is not None:
-        print_written(output, f"{len(simulation.recording)} rows")
-    write_page(result, folder, None)
+    results.show(result, scenario, saved=output)
     if page is not None:
         print("the page can replay the motion; press Stop, Escape or Ctrl-C to end", flush=True)
         until_stopped(page)
@@ -93,12 +82,7 @@ def study(
         int | None, Parameter(metavar="N", group=_EXECUTOR, converter=whole_number, validator=_check_workers)
     ] = None,
     scheduler: Annotated[str | None, Parameter(metavar="ADDRESS", group=_EXECUTOR)] = None,
-    plots: Plots = None,
-    report: Report = None,
-    overwrite: Annotated[
-        Overwrite, Parameter(help="Replace the --report file, and write into a --plots folder that is not empty.")
-    ] = False,
-    verbose: Verbose = False,
+    results: Results = _RESULTS,
 ) -> None:
     """Simulate a scenario with many poses, seeds and variations.
 
@@ -111,15 +95,12 @@ def study(
     from dvrk_drake.experiments.study.study import dask_executor, run_study, run_study_locally
     from dvrk_drake.experiments.study.study_file import load_study
     from dvrk_drake.reports.study import study_page
-    from dvrk_drake.reports.terminal import make_console, print_page
 
-    quiet_drake()
     loaded = load_study(study, set or [])
     if not output.lower().endswith((".csv", ".parquet")):
         raise StudyError(f"{output}: must end in .csv or .parquet")
     check_output(output, overwrite=True)
-    check_report(report, study, overwrite=overwrite)
-    folder = plots_folder(plots, overwrite=overwrite)
+    results.check(study)
     step = f"simulating {len(loaded.cases)} runs"
     with Steps(step) as steps:
 
@@ -131,10 +112,8 @@ def study(
         else:
             with dask_executor(scheduler) as executor:
                 rows = run_study(loaded, executor, output, show)
-    page = study_page(loaded, rows, study_path=study if folder is None else None)
-    print_page(make_console(), page, verbose=verbose)
-    print_written(output, f"{len(rows)} runs")
-    write_page(page, folder, report, study, output)
+    page = study_page(loaded, rows, study_path=study if results.plots is None else None)
+    results.show(page, study, output, saved=output)
 
 
 @simulate.command
@@ -149,10 +128,7 @@ def tune(
         ),
     ] = "both",
     output: Annotated[str | None, Parameter(metavar="GAINS.yaml")] = None,
-    plots: Plots = None,
-    report: Report = None,
-    overwrite: Overwrite = False,
-    verbose: Verbose = False,
+    results: Results = _RESULTS,
 ) -> None:
     """Tune controller gains on a simulated arm.
 
@@ -164,15 +140,10 @@ def tune(
     from dvrk_drake.experiments.tuning.tuning import Method, tune_arm
     from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.models.arm_schema import save_gains
-    from dvrk_drake.reports.terminal import make_console, print_page
     from dvrk_drake.reports.tuning import tuning_page
 
-    quiet_drake()
     tuned = load_arm(arm)
-    if output is not None:
-        check_output(output, arm, overwrite=overwrite)
-    check_report(report, arm, overwrite=overwrite)
-    folder = plots_folder(plots, overwrite=overwrite)
+    results.check(arm, output=output)
     methods: list[Method] = ["paper", "model"] if method == "both" else [method]
     step = f"tuning {tuned.name}"
     with Steps(step) as steps:
@@ -180,11 +151,7 @@ def tune(
     best = tuning.comparison.best(tuning.found)
     if output is not None:
         save_gains(tuning.found[best], output, f"{tuned.name}: dvrk-drake simulate tune --arm {arm}, method {best}.")
-    page = tuning_page(tuning, gains_path=output)
-    print_page(make_console(), page, verbose=verbose)
-    if output is not None:
-        print_written(output)
-    write_page(page, folder, report)
+    results.show(tuning_page(tuning, gains_path=output), saved=output)
 
 
 @simulate.command
@@ -199,10 +166,7 @@ def transparency(
     simulated_effects: Annotated[list[str] | None, Parameter(metavar="EFFECT ..", consume_multiple=True)] = None,
     frame: Annotated[str, Parameter(metavar="NAME", show_default=False)] = "",
     output: Annotated[str | None, Parameter(metavar="FILE.csv")] = None,
-    plots: Plots = None,
-    report: Report = None,
-    overwrite: Overwrite = False,
-    verbose: Verbose = False,
+    results: Results = _RESULTS,
 ) -> None:
     """Simulate the interaction force when an operator moves an arm.
 
@@ -217,12 +181,10 @@ def transparency(
             file, or the last link.
         output: CSV file for the results.
     """
-    from dvrk_drake.experiments.transparency import random_path, recorded_path, simulate_operator
+    from dvrk_drake.experiments.transparency import listed_compensations, random_path, recorded_path, simulate_operator
     from dvrk_drake.models.arm_files import load_arm
-    from dvrk_drake.reports.terminal import make_console, print_page
     from dvrk_drake.reports.transparency import transparency_page, write_transparency
 
-    quiet_drake()
     moved_arm = load_arm(arm)
     effects = moved_arm.effects.only(simulated_effects or ["all"])
     followed = random_path(moved_arm)
@@ -233,13 +195,10 @@ def transparency(
         raise ScenarioError("--speed requires --path with a recorded motion")
     if friction_ratio is None:
         friction_ratio = 0.5 if moved_arm.effects.friction else 0.0
-    compensations = _compensations(moved_arm, model or [], friction_ratio)
-    if output is not None:
-        if not output.lower().endswith(".csv"):
-            raise ScenarioError(f"{output}: --output must end in .csv; figures are written to --plots FOLDER")
-        check_output(output, path or "", *(model or []), overwrite=overwrite)
-    check_report(report, path or "", *(model or []), overwrite=overwrite)
-    folder = plots_folder(plots, overwrite=overwrite)
+    compensations = listed_compensations(moved_arm, model or [], friction_ratio)
+    if output is not None and not output.lower().endswith(".csv"):
+        raise ScenarioError(f"{output}: --output must end in .csv; figures are written to --plots FOLDER")
+    results.check(path, *(model or []), output=output)
     forces = []
     names = [f"compensation by {one.name}" if one.model else "no compensation" for one in compensations]
     with Steps(*names) as steps:
@@ -252,39 +211,4 @@ def transparency(
             )
     if output is not None:
         write_transparency(Path(output), forces)
-    page = transparency_page(moved_arm, forces)
-    print_page(make_console(), page, verbose=verbose)
-    if output is not None:
-        print_written(output)
-    write_page(page, folder, report, *([path] if path else []), *(model or []))
-
-
-def _compensations(arm: dvrk.Arm, paths: list[str], friction_ratio: float) -> list[Compensation]:
-    """Returns the compensations to compare: none, each model, and each model with friction compensation.
-
-    Raises:
-        ModelError: A model belongs to another arm, or two models have the same name.
-        ControllerError: The friction ratio is out of range.
-    """
-    from dvrk_drake.dynamics.friction_compensation import check_ratios
-    from dvrk_drake.experiments.transparency import Compensation
-
-    check_ratios(friction_ratio)
-    models = {}
-    for path in paths:
-        name = Path(path).stem
-        if name in models:
-            raise ModelError(f"--model {path}: two models have the file name {name}; rename one of the files")
-        if "=" in path and not Path(path).is_file():
-            raise ModelError(
-                f"--model {path}: no such file. The form NAME=PATH is not supported; give the path of the model file"
-            )
-        models[name] = dvrk.IdentifiedModel.load(path, arm)
-    if not models:
-        models["SDF"] = dvrk.IdentifiedModel.from_arm(arm)
-    listed = [Compensation("nothing")]
-    for name, model in models.items():
-        listed.append(Compensation(name, model))
-        if friction_ratio:
-            listed.append(Compensation(f"{name}, friction {friction_ratio:g}", model, friction_ratio))
-    return listed
+    results.show(transparency_page(moved_arm, forces), path, *(model or []), saved=output)

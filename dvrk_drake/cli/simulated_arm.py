@@ -12,7 +12,6 @@ from dvrk_drake.cli.support import (
     driver_configuration,
     interrupt_ends_process,
     mounted,
-    quiet_drake,
     request_realtime,
 )
 
@@ -53,7 +52,6 @@ def sim_arm(
     from dvrk_drake.systems.ros.crtk_driver import CrtkDriver
     from dvrk_drake.systems.ros.open_domain import domain_number
 
-    quiet_drake()
     connected.check(lcm={"driver": driver, "meshcat": meshcat}, ros={"rate": rate, "model": model, "enabled": enabled})
     arm = mounted(load_arm(connected.arm), gravity)
     simulated_effects = None if effects is None else arm.effects.only(effects)

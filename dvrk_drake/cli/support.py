@@ -57,6 +57,8 @@ def import_interruptibly() -> None:
     with interrupt_ends_process():
         for module in modules:
             importlib.import_module(module)
+        # Importing Drake sets the log level.
+        logging.getLogger("drake").setLevel(logging.WARNING)
 
 
 @contextmanager
@@ -76,11 +78,6 @@ def interrupt_ends_process() -> Iterator[None]:
     finally:
         if signal.getsignal(signal.SIGINT) is leave:
             signal.signal(signal.SIGINT, before)
-
-
-def quiet_drake() -> None:
-    """Disables Drake's log messages. Importing Drake sets the log level, so call this function after the import."""
-    logging.getLogger("drake").setLevel(logging.WARNING)
 
 
 def load_key(path: str | None) -> MessageKey | None:
@@ -241,10 +238,8 @@ def driver_configuration(path: str | None, key: str | None, lcm_url: str) -> Dvr
 
     driver = DvrkDriver() if path is None else load_driver(path)
     driver.key_file = key or driver.key_file
-    if weaker := driver.guard.weaker_than_default():
-        print_warning(f"the guard protects the arm less than with its default settings: {weaker}")
-    if driver.gravity_compensation:
-        print_warning("the arm adds its own gravity compensation to commanded efforts (gravity_compensation: true)")
+    for warning in driver.warnings():
+        print_warning(warning)
     driver.lcm_url = open_lcm(lcm_url or driver.lcm_url).get_lcm_url()
     return driver
 

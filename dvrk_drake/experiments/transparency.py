@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +13,10 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput
 from pydrake.trajectories import PiecewisePolynomial, PiecewisePose
 
-from dvrk_drake.dynamics.friction_compensation import Friction
+from dvrk_drake.dynamics.friction_compensation import Friction, check_ratios
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.kinematics import ArmFrame
-from dvrk_drake.errors import ScenarioError
+from dvrk_drake.errors import ModelError, ScenarioError
 from dvrk_drake.experiments.simulation import advance, samples, simulated_holding_error
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import ArmEffects
@@ -196,3 +197,36 @@ def _friction(arm: Arm, compensation: Compensation) -> FrictionCompensator | Non
 
 def _rms(vectors: NDArray[np.float64]) -> float:
     return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
+
+
+def listed_compensations(arm: Arm, paths: Sequence[str], friction_ratio: float) -> list[Compensation]:
+    """Returns the compensations to compare: none, each model, and each model with friction compensation.
+
+    Args:
+        arm: Arm that is moved.
+        paths: Paths of the model files. Empty: the nominal model is used.
+        friction_ratio: Share of the friction to compensate, 0 to 0.6.
+
+    Raises:
+        ModelError: A model belongs to another arm, or two models have the same name.
+        ControllerError: The friction ratio is out of range.
+    """
+    check_ratios(friction_ratio)
+    models = {}
+    for path in paths:
+        name = Path(path).stem
+        if name in models:
+            raise ModelError(f"--model {path}: two models have the file name {name}; rename one of the files")
+        if "=" in path and not Path(path).is_file():
+            raise ModelError(
+                f"--model {path}: no such file. The form NAME=PATH is not supported; give the path of the model file"
+            )
+        models[name] = IdentifiedModel.load(path, arm)
+    if not models:
+        models["SDF"] = IdentifiedModel.from_arm(arm)
+    listed = [Compensation("nothing")]
+    for name, model in models.items():
+        listed.append(Compensation(name, model))
+        if friction_ratio:
+            listed.append(Compensation(f"{name}, friction {friction_ratio:g}", model, friction_ratio))
+    return listed

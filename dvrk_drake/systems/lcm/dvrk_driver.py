@@ -74,6 +74,15 @@ class DvrkDriver:
         if self.model:
             self.model = str(folder / self.model)
 
+    def warnings(self) -> list[str]:
+        """Returns a line each on weaker guard settings than the defaults, and on an arm that compensates gravity."""
+        lines = []
+        if weaker := self.guard.weaker_than_default():
+            lines.append(f"the guard protects the arm less than with its default settings: {weaker}")
+        if self.gravity_compensation:
+            lines.append("the arm adds its own gravity compensation to commanded efforts (gravity_compensation: true)")
+        return lines
+
     def load_model(self, arm: Arm) -> IdentifiedModel | None:
         """Returns the model in the file `model`, or None if `model` is empty.
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from guard_bench import Bench, N
 
-from dvrk_drake.cli.support import driver_configuration
 from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
@@ -402,21 +401,13 @@ def test_late_commands_do_not_act_again_without_an_operator():
         GuardSettings(expiry=0.51, resume_automatically=True)
 
 
-def test_weaker_settings_are_in_the_status_and_printed(capsys, tmp_path):
+def test_weaker_settings_are_in_the_status_and_warned():
     settings = GuardSettings(expiry=0.1)
     status = Status()
     fill_in_guard(status, Bench(settings=settings).guard)
     assert status.weaker_settings == "expiry is 0.1 (default: 0.05)"
     live = LiveStatusMaker(5, status).make(status, 1.0, 0)
     assert live.problem == "guard settings weaker than the defaults: expiry is 0.1 (default: 0.05)"
-    weaker, own_gravity = tmp_path / "weaker.yaml", tmp_path / "own_gravity.yaml"
-    weaker.write_text("guard: {expiry: 0.1}\n")
-    own_gravity.write_text("gravity_compensation: true\n")
-    for path in (str(weaker), None, str(own_gravity)):
-        driver_configuration(path, None, "memq://")
-    assert capsys.readouterr().err.splitlines() == [
-        "dvrk-drake: warning: the guard protects the arm less than with its default settings: "
-        "expiry is 0.1 (default: 0.05)",
-        "dvrk-drake: warning: the arm adds its own gravity compensation to commanded efforts "
-        "(gravity_compensation: true)",
-    ]
+    weaker = "the guard protects the arm less than with its default settings: expiry is 0.1 (default: 0.05)"
+    assert DvrkDriver(guard=settings).warnings() == [weaker] and DvrkDriver().warnings() == []
+    assert "adds its own gravity compensation" in DvrkDriver(gravity_compensation=True).warnings()[0]
