@@ -24,7 +24,7 @@ from dvrk_drake.cli.support import (
 from dvrk_drake.errors import DvrkDrakeError
 
 if TYPE_CHECKING:
-    from dvrk_drake.analysis.check.findings import Finding
+    from dvrk_drake.analysis.observations.finding import Finding
     from dvrk_drake.reports.page import Page
 
 Report = Annotated[
