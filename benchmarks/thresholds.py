@@ -78,7 +78,7 @@ def pose_errors(read: Recordings) -> dict[str, str]:
     """Returns the mean cross-validated errors of static models, and the joints without a full feedforward."""
     errors = {}
     for file, (recording, arm) in read.items():
-        if file.startswith("mtm") and not recording.is_motion and "coupled12" not in file:
+        if recording.tau is not None and not recording.is_motion and "coupled12" not in file:
             joints = dvrk.identify(recording, arm).model.joints
             shares = [j.rms_cross_validation_included / j.rms_zero_torque_included for j in joints]
             scales = {j.name: round(j.feedforward_scale, 2) for j in joints if j.feedforward_scale < 1}
