@@ -22,17 +22,15 @@ from dvrk_drake.cli.app import (
     identify,
     one_of,
 )
-from dvrk_drake.cli.report import Json, Plots, Report, ResultsAndJson, check_report, write_page
+from dvrk_drake.cli.report import Results, ResultsAndJson
 from dvrk_drake.cli.support import (
     Steps,
     check_output,
     load_model,
     mounted,
-    plots_folder,
     print_notes,
     print_warnings,
     print_written,
-    write_json,
 )
 from dvrk_drake.errors import ModelError
 
@@ -70,7 +68,7 @@ Compare = Annotated[
 ]
 NewModel = Annotated[str, Parameter(metavar="MODEL.yaml", help="Model file to write.")]
 _FILE = FileOptions()
-_RESULTS = ResultsAndJson()
+_PAGE, _RESULTS = Results(), ResultsAndJson()
 _STEPS = "reading", "checking the recording"
 _SOURCE = one_of("Source of the model (one is required)")
 
@@ -87,10 +85,7 @@ def identify_model(
     gravity: OwnGravity = None,
     locked: Locked = None,
     compare: Compare = None,
-    plots: Plots = None,
-    report: Report = None,
-    overwrite: Overwrite = False,
-    verbose: Verbose = False,
+    results: Results = _PAGE,
 ) -> None:
     """Identify a model from a recording, or from several.
 
@@ -102,13 +97,10 @@ def identify_model(
         others: More motions of the same arm, or static poses.
         method: Method for static poses: robust regression, or the least squares of the paper (Rutfield et al., 2015).
     """
-    from dvrk_drake.reports.terminal import make_console, print_page
 
     paths = (recording, *others)
-    check_output(output, *paths, overwrite=overwrite)
-    check_report(report, *paths, overwrite=overwrite)
+    results.check(*paths, output=output)
     recorded_arm = mounted(dvrk.load_arm(arm), None if gravity == "estimate" else gravity, locked)
-    folder = plots_folder(plots, overwrite=overwrite)
     with Steps(*_STEPS, "identifying") as steps:
         read = []
         for path in paths:
@@ -123,14 +115,9 @@ def identify_model(
         )
     # Results are saved before printing, because the reader of the output (e.g. head) may close the pipe.
     result.save(output, overwrite=True)
-    page, console = _page(result, output, file, compare), make_console()
-    print_page(console, page, verbose=verbose)
-    if result.note:
-        console.print(result.note)
-    print_warnings(console, result.warnings)
-    print_written(output)
-    _print_report_option(report)
-    write_page(page, folder, report, *paths)
+    page = _page(result, output, file, compare)
+    results.show(page, *paths, note=result.note, warnings=result.warnings, saved=output)
+    _print_report_option(results.report)
 
 
 def _page(
@@ -177,26 +164,19 @@ def validate(
     compare: Compare = None,
     require: Literal["good", "usable"] | None = None,
     save: Annotated[bool, Parameter(show_default=False)] = False,
-    json: Json = None,
-    plots: Plots = None,
-    report: Report = None,
-    overwrite: Annotated[Overwrite, Parameter(help="Replace existing files, plots and stored verdicts.")] = False,
-    verbose: Verbose = False,
+    results: ResultsAndJson = _RESULTS,
 ) -> None:
     """Evaluate the error of a model on another recording.
 
     Args:
         require: Exit with code 2 unless each joint with feedforward has at least this verdict.
-        save: Store the verdicts in the model file; dvrk-drake control checks them.
+        save: Store the verdicts in the model file; dvrk-drake control checks them. With --overwrite, stored verdicts
+            are replaced.
     """
-    from dvrk_drake.reports.terminal import make_console, print_page
 
-    if json is not None:
-        check_output(json, recording, model, overwrite=overwrite)
-    check_report(report, recording, model, overwrite=overwrite)
+    results.check(recording, model)
     with Steps(*_STEPS, "validating") as steps:
         loaded, read = _model_and_recording(model, recording, file, steps)
-        folder = plots_folder(plots, overwrite=overwrite)
         if (save or require) and loaded.provenance.includes(read.sha256):
             option = "--save" if save else "--require"
             raise ModelError(
@@ -204,26 +184,18 @@ def validate(
             )
         if save:
             check_output(model, recording, overwrite=True)
-            if loaded.validation is not None and not overwrite:
+            if loaded.validation is not None and not results.overwrite:
                 saved = loaded.validation.recording
                 raise ModelError(f"{model}: contains verdicts from {saved}; use --overwrite to replace them")
         validation = dvrk.validate(loaded, read, progress=steps)
     # Results are saved before printing, because the reader of the output (e.g. head) may close the pipe.
     if save:
         validation.save(model, overwrite=True)
-    if json is not None:
-        write_json(json, validation.as_dict())
-    page, console = _page(validation, model, file, compare, saved=save), make_console()
-    print_page(console, page, verbose=verbose)
-    if validation.note:
-        console.print(validation.note)
-    print_warnings(console, validation.warnings)
-    if json is not None:
-        print_written(json)
+    page, content = _page(validation, model, file, compare, saved=save), validation.as_dict()
+    results.show(page, recording, model, content=content, note=validation.note, warnings=validation.warnings)
     if save:
         print_written(model, "verdicts stored")
-    _print_report_option(report)
-    write_page(page, folder, report, recording, model)
+    _print_report_option(results.report)
     if require is not None and (failed := validation.unfit(require)):
         advice = "identify from a recording with more varied poses"
         if loaded.dynamics is not None:

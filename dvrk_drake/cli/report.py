@@ -67,6 +67,7 @@ class Results:
         page: Page,
         *inputs: str | None,
         content: object = None,
+        note: str = "",
         warnings: Sequence[Finding] = (),
         saved: str | None = None,
     ) -> None:
@@ -76,6 +77,7 @@ class Results:
             page: Page of the result.
             inputs: Paths of the input files. None or "": there is none.
             content: Content of the JSON file.
+            note: Note on the result to print. "": there is none.
             warnings: Warnings to print.
             saved: Path of an output that was written already. None: there is none.
         """
@@ -86,6 +88,8 @@ class Results:
             write_json(self._json, content)
         console = make_console()
         print_page(console, page, verbose=self.verbose)
+        if note:
+            console.print(note)
         print_warnings(console, warnings)
         for path in filter(None, (saved, self._json)):
             print_written(path)

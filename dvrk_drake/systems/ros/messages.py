@@ -80,7 +80,10 @@ class JointState(IdlStruct, typename="sensor_msgs::msg::dds_::JointState_"):
     effort: sequence[float64] = field(default_factory=list)
 
     def serialize(self, buffer: Any = None, endianness: Any = None, use_version_2: bool | None = None) -> bytes:
-        """Returns the encoded message. XCDR1 needs a fifth of the time of the encoder of cyclonedds."""
+        """Returns the encoded message.
+
+        For 7 joints, XCDR1 needs 0.6 of the time of the encoder of rosbags, and a fifth of that of cyclonedds.
+        """
         if buffer is not None or endianness is not None or use_version_2:
             return bytes(super().serialize(buffer, endianness, use_version_2))
         data = bytearray(_XCDR1 + _STAMP.pack(self.header.stamp.sec, self.header.stamp.nanosec))
@@ -97,7 +100,9 @@ class JointState(IdlStruct, typename="sensor_msgs::msg::dds_::JointState_"):
 
     @classmethod
     def deserialize(cls, data: bytes, has_header: bool = True, use_version_2: bool | None = None) -> "JointState":
-        """Returns the decoded message. XCDR1 needs a third of the time of the decoder of cyclonedds.
+        """Returns the decoded message.
+
+        For 7 joints, XCDR1 needs 0.8 of the time of the decoder of rosbags, and a third of that of cyclonedds.
 
         Raises:
             ValueError, struct.error: The data are not an encoded JointState.
