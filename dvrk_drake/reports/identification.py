@@ -129,9 +129,16 @@ def _baseline_ratios(efforts: Efforts) -> dict[str, NDArray[np.float64]]:
     return ratios
 
 
-def _table(header: Sequence[str], rows: Sequence[Sequence], caption: str, note: str = "") -> Table:
-    right = [k > 1 for k in range(len(header))]
-    return Table(("joint", "verdict", *header), rows, caption, note, right=[False, False, *right[2:], True, True])
+def _table(header: Sequence[str], rows: Sequence[Sequence], caption: str, zero_torque: str) -> Table:
+    """Returns a table with one row per joint. `zero_torque` is the relative error of zero torque as text."""
+    note = ""
+    if "SDF error" in header:
+        note = (
+            "SDF error: relative error of the nominal model, which consists of the SDF and the arm file. Zero torque "
+            f"has a relative error of {zero_torque}."
+        )
+    right = [False, False, *len(header) * [True]]
+    return Table(("joint", "verdict", *header), rows, caption, note, right=right)
 
 
 def _identified_motion(result: DynamicIdentification, efforts: Efforts) -> list[Block]:
@@ -154,7 +161,12 @@ def _identified_motion(result: DynamicIdentification, efforts: Efforts) -> list[
     if several:
         how = "each recording is predicted by a model of the others, with the mean of their offsets and friction"
     blocks: list[Block] = [
-        _table(header, rows, f"{several}{result.num_rows} rows of motion: actuator effort and relative error (RMS)"),
+        _table(
+            header,
+            rows,
+            f"{several}{result.num_rows} rows of motion: actuator effort and relative error (RMS)",
+            "100 %",
+        ),
         Text(
             f"Low-pass filter of the efforts: {section.signals.effort_cut_off:g} Hz. Cross-validation: {how}. On "
             "another recording the error can be larger, because friction changes from day to day. Repeatability: "
@@ -207,7 +219,7 @@ def _identified_poses(result: StaticIdentification, efforts: Efforts) -> list[Bl
     header = ("effort", "error", "ratio", *others, "feedforward scale", "range covered")
     fits = ("", "fit", "leave-one-out", "zero torque*", "fit*", "leave-one-out*", "positions [rad; m]")
     blocks: list[Block] = [
-        _table(header, rows, f"{poses} static poses: RMS joint effort, cross-validation error [N m; N] and ratio"),
+        _table(header, rows, f"{poses} static poses: RMS joint effort, cross-validation error [N m; N] and ratio", "1"),
         Text(
             "Cross-validation error: 10 folds over the poses. Effects, parameters and feedforward scales are estimated "
             "anew in each fold. The effort is the error of zero torque.",
@@ -241,7 +253,7 @@ def _validated_motion(validation: DynamicValidation, efforts: Efforts) -> list[B
     header = ("effort", "error", "ratio", "repeatability", "inside", "other day", *others)
     name = _name(validation.recording)
     return [
-        _table(header, rows, f"Motion of {name}: RMS actuator effort and error [N m; N], relative error"),
+        _table(header, rows, f"Motion of {name}: RMS actuator effort and error [N m; N], relative error", "100 %"),
         Text(
             "inside: share of the measured efforts inside the prediction interval of the same day. other day: inside "
             f"the interval of another day. {validation.model.interval_scope}",
@@ -262,7 +274,7 @@ def _validated_poses(validation: StaticValidation, efforts: Efforts) -> list[Blo
         every.append((own.name, f"{own.rms_torque:.4f}", f"{own.rms_error:.4f}", all_ratio))
     name, header = _name(validation.recording), ("effort", "error", "ratio", *others, "excluded")
     blocks: list[Block] = [
-        _table(header, rows, f"{validation.poses} poses of {name}: RMS joint effort and error [N m; N], ratio"),
+        _table(header, rows, f"{validation.poses} poses of {name}: RMS joint effort and error [N m; N], ratio", "1"),
         Text(rule_text(), show="details"),
     ]
     if validation.excluded:

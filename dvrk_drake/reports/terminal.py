@@ -100,6 +100,8 @@ def print_page(console: Console, page: Page, *, verbose: bool = False) -> None:
                 console.print(block.text, style=style, markup=False, soft_wrap=True)
             else:
                 console.print(_plain(block.text), style=style, markup=False, width=width)
+    if blocks and not getattr(blocks[-1], "note", ""):
+        console.print()
 
 
 def print_answer(console: Console, answer: str, next_step: str, level: Level = "good") -> None:

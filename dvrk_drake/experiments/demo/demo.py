@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.geometry import Meshcat, MeshcatAnimation
+from pydrake.geometry import Meshcat, MeshcatAnimation, Rgba
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput, TrajectorySource
@@ -56,7 +56,9 @@ PHASES = (
     (HELD_UNTIL, "released: gravity compensation only"),
     (RELEASED_UNTIL, "driven home: the controller regulates a motion"),
 )
-COLOURS = "grey arm: identified model     orange arm: model of the SDF, not identified"
+COLOURS = "grey arm: identified model     green arm: model of the SDF, not identified"
+#: Colour of the ghost: that of the model of the SDF in the plots.
+GHOST_COLOUR = Rgba(0.17, 0.67, 0.4, 0.5)
 
 
 @dataclass(frozen=True)
@@ -301,7 +303,9 @@ def _release(
             controller.SetMode(settings, "gravity")
         elif i == _index(RELEASED_UNTIL):
             controller.SetMode(settings, "hold")
-    return t, samples(log, simulator)[:, : arm.num_joints]
+    q = samples(log, simulator)[:, : arm.num_joints]
+    simulator.get_system().ForcedPublish(context)  # the recording of the links ends at the last sample
+    return t, q
 
 
 def _animated_release(
@@ -317,7 +321,7 @@ def _animated_release(
     While the arm is released, the animation shows the poses `ghost` (k, n) of another simulation as a ghost arm.
     """
     overlay = ArmOverlay(station.arm, meshcat)
-    overlay.add_ghost(GHOST)
+    overlay.add_ghost(GHOST, GHOST_COLOUR)
     overlay.captions.set_text("colours", COLOURS, v=-0.82)
 
     def draw(i: int, q: NDArray[np.float64]) -> None:
@@ -330,6 +334,7 @@ def _animated_release(
 
     with recorded_in(meshcat):
         _, q = _release(station, model, plan, HOME_UNTIL, progress, draw)
+        overlay.end_recording(HOME_UNTIL)
         animation = meshcat.get_mutable_recording()
         animation.set_loop_mode(MeshcatAnimation.LoopMode.kLoopRepeat)
         animation.set_repetitions(10_000)

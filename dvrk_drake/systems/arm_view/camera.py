@@ -17,6 +17,9 @@ from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import add_arm, set_arm_positions
 
+#: Share of its range by which a prismatic joint is extended in the first pose of a view: 0.1 m for the insertion of a
+#: PSM.
+EXTENSION = 5 / 12
 #: Direction from the target to the camera in the base frame. Magnification relative to Meshcat's default view angle of
 #: 75 degrees.
 DIRECTION, ZOOM = (1.1, 1.0, 0.3), 2.8
@@ -108,8 +111,14 @@ def _framing(p_WC: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np
 
 
 def home_position(arm: Arm) -> NDArray[np.float64]:
-    """Returns the home pose (n,) [rad, m]: all joints at zero, or at the limit nearest to zero."""
-    return np.clip(np.zeros(arm.num_joints), arm.position_lower, arm.position_upper)
+    """Returns the first pose (n,) of a view [rad, m].
+
+    Revolute joints are at zero, or at the limit nearest to zero. Prismatic joints are extended by `EXTENSION`, because
+    a retracted instrument is hidden.
+    """
+    zero = np.clip(np.zeros(arm.num_joints), arm.position_lower, arm.position_upper)
+    extended = arm.position_lower + EXTENSION * (arm.position_upper - arm.position_lower)
+    return np.where(arm.prismatic, extended, zero)
 
 
 @cache

@@ -13,7 +13,7 @@ class JointSliders:
     """One slider per independent joint, from its lower to its upper limit.
 
     Attributes:
-        names: Names of the sliders.
+        names: Names of the sliders, with their units.
         degrees: Whether revolute joints have degrees, and prismatic joints mm. Otherwise, the units are rad and m.
         stopped_by: Description of the coupled limits that stopped the sliders, or "".
     """
@@ -22,13 +22,16 @@ class JointSliders:
         """Adds the sliders at the pose q (n,) [rad, m]."""
         self._arm, self._meshcat = arm, meshcat
         self._q = np.array(q, float)
-        self.names = [f"q{i + 1} {name}" for i, name in enumerate(arm.joint_names)]
+        self.names: list[str] = []
         self.degrees = False
         self.stopped_by = ""
         self._add()
 
     def _add(self) -> None:
         self._unit = self._arm.per_joint(np.radians(1.0), 1e-3) if self.degrees else np.ones(self._arm.num_joints)
+        units = ("deg", "mm") if self.degrees else ("rad", "m")
+        joints = enumerate(zip(self._arm.joint_names, self._arm.prismatic, strict=True), 1)
+        self.names = [f"q{i} {name} [{units[int(slides)]}]" for i, (name, slides) in joints]
         lower, upper = self._arm.position_lower / self._unit, self._arm.position_upper / self._unit
         for i, name in enumerate(self.names):
             step = (upper[i] - lower[i]) / 1000
@@ -36,9 +39,9 @@ class JointSliders:
 
     def set_degrees(self, degrees: bool) -> None:
         """Replaces the sliders by sliders in the other units."""
-        self.degrees = degrees
         for name in self.names:
             self._meshcat.DeleteSlider(name)
+        self.degrees = degrees
         self._add()
 
     def set_positions(self, q: ArrayLike) -> None:

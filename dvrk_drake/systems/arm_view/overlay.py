@@ -147,6 +147,10 @@ class ArmOverlay:
         """Shows the name of a phase, e.g. "released". "" shows nothing. A recording stores the change at `time` [s]."""
         self.captions.set_phase(text, time)
 
+    def end_recording(self, time: float) -> None:
+        """Stores the last state of all objects at the end of a recording [s], so that all tracks have one length."""
+        self._scene.end_recording(time)
+
     def set_title(self, text: str) -> None:
         """Shows a title at the upper edge of the view."""
         self.captions.set_text("title", text, v=TITLE_EDGE)

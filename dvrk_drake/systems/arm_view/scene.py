@@ -21,6 +21,7 @@ class Scene:
         self._transforms: dict[str, NDArray[np.float64]] = {}
         self._visible: dict[str, bool] = {}
         self._recorded: set[str] = set()
+        self._moved: dict[str, RigidTransform] = {}
         meshcat.Delete(root)
 
     def path(self, name: str) -> str:
@@ -39,6 +40,8 @@ class Scene:
             return
         self._transforms[name] = matrix
         if scale == 1.0:
+            if time is not None:
+                self._moved[name] = X_PN
             self.meshcat.SetTransform(self.path(name), X_PN, time)
         else:
             self.meshcat.SetTransform(self.path(name), np.asfortranarray(matrix))
@@ -54,3 +57,13 @@ class Scene:
             self._recorded.add(name)
             self.meshcat.SetProperty(self.path(name), "visible", before is not False, 0.0)
         self.meshcat.SetProperty(self.path(name), "visible", visible, time)
+
+    def end_recording(self, time: float) -> None:
+        """Stores the last pose and visibility of all recorded objects at the end of a recording [s].
+
+        Otherwise the track of each object ends at its last change, and each track repeats alone.
+        """
+        for name, X_PN in self._moved.items():
+            self.meshcat.SetTransform(self.path(name), X_PN, time)
+        for name in self._recorded:
+            self.meshcat.SetProperty(self.path(name), "visible", self._visible[name], time)

@@ -178,6 +178,8 @@ def test_animation_repeats_and_changes_its_caption(result, open_page):
     assert page.page.title().startswith("MTML")
     loop = "viewer.animator.actions.every((action) => action.loop === 2201 && action.repetitions >= 1000)"
     assert page.page.evaluate(loop), "2201 is THREE.LoopRepeat"
+    ends = page.page.evaluate("viewer.animator.actions.map((action) => action.getClip().duration)")
+    np.testing.assert_allclose(ends, demo.HOME_UNTIL, atol=1e-6, err_msg="tracks of other lengths would repeat alone")
     shown = []
     for time in (0.5, 3.0, 6.5):
         script = """(time) => {

@@ -39,16 +39,16 @@ def test_dependent_joints_follow(view):
 
 def test_sliders_stop_at_the_coupled_limit(view):
     for i, name in enumerate(view.arm.joint_names):
-        view.meshcat.SetSliderValue(f"q{i + 1} {name}", 0.0)
+        view.meshcat.SetSliderValue(f"q{i + 1} {name} [rad]", 0.0)
     view.follow_controls()
-    view.meshcat.SetSliderValue("q2 shoulder_pitch", 0.6)
+    view.meshcat.SetSliderValue("q2 shoulder_pitch [rad]", 0.6)
     q = view.follow_controls()
     assert q[1] == pytest.approx(0.6, abs=2e-3)
-    view.meshcat.SetSliderValue("q3 elbow_pitch", 0.6)
+    view.meshcat.SetSliderValue("q3 elbow_pitch [rad]", 0.6)
     q = view.follow_controls()
     assert q[1] + q[2] <= 0.68 + 2e-3
     assert q[1] + q[2] > 0.6
-    assert view.meshcat.GetSliderValue("q3 elbow_pitch") == pytest.approx(q[2])
+    assert view.meshcat.GetSliderValue("q3 elbow_pitch [rad]") == pytest.approx(q[2])
 
 
 def test_other_sliders_move_at_the_coupled_limit(view):
@@ -59,13 +59,13 @@ def test_other_sliders_move_at_the_coupled_limit(view):
     view.follow_controls()
     with np.errstate(all="raise"):
         for wanted in (0.2, 0.4):
-            view.meshcat.SetSliderValue("q1 outer_yaw", wanted)
-            view.meshcat.SetSliderValue("q3 elbow_pitch", 0.6)
+            view.meshcat.SetSliderValue("q1 outer_yaw [rad]", wanted)
+            view.meshcat.SetSliderValue("q3 elbow_pitch [rad]", 0.6)
             q = view.follow_controls()
             assert q[0] == pytest.approx(wanted, abs=2e-3)
             assert 0.67 < q[1] + q[2] < 0.685
     assert view._sliders.stopped_by == "stopped by the limit parallelogram: -0.33 to 0.68 rad"
-    view.meshcat.SetSliderValue("q3 elbow_pitch", 0.1)
+    view.meshcat.SetSliderValue("q3 elbow_pitch [rad]", 0.1)
     assert view.follow_controls()[2] == pytest.approx(0.1, abs=2e-3)
     assert view._sliders.stopped_by == ""
 
@@ -74,14 +74,15 @@ def test_psm_sliders_move_joints_and_linkage():
     view = ArmView(load_arm("psm"), start_meshcat())
     view.add_sliders()
     assert view._sliders.names == [
-        "q1 yaw",
-        "q2 pitch",
-        "q3 insertion",
-        "q4 roll",
-        "q5 wrist_pitch",
-        "q6 wrist_yaw",
-        "q7 jaw",
+        "q1 yaw [rad]",
+        "q2 pitch [rad]",
+        "q3 insertion [m]",
+        "q4 roll [rad]",
+        "q5 wrist_pitch [rad]",
+        "q6 wrist_yaw [rad]",
+        "q7 jaw [rad]",
     ]
+    assert view._q[2] == pytest.approx(0.1), "the instrument is visible"
     wanted = [-0.7, 0.6, 0.15, 2.0, -0.5, 0.8, 0.9]
     for name, value in zip(view._sliders.names, wanted, strict=True):
         view.meshcat.SetSliderValue(name, value)
