@@ -19,7 +19,7 @@ from dvrk_drake.analysis.results import Identification, Validation
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.recording import Recording
-from dvrk_drake.reports.colours import COMMANDED, FITTED, HELD_OUT, LIMIT, MEASURED, NEUTRAL, REFERENCE, SERIES
+from dvrk_drake.reports.colours import COMMANDED, FITTED, HELD_OUT, MEASURED, NEUTRAL, REFERENCE, SERIES
 from dvrk_drake.reports.page import Plot, Table
 from dvrk_drake.reports.plot import (
     Band,
@@ -50,13 +50,9 @@ _COLOURS = {
     "SDF": REFERENCE,
     "previous": COMMANDED,
 }
-_BUDGET = dict(
-    zip(
-        (*SHARE_LABELS, "first harmonic", "second harmonic", "load"),
-        (*SERIES[:5], *SERIES[6:], NEUTRAL, SERIES[2], SERIES[5], SERIES[3]),
-        strict=True,
-    )
-)
+#: Colour of each cause of an error, in the order of the bars. A motion and static poses have different causes.
+_BUDGET = dict(zip(SHARE_LABELS[:-1], (*SERIES[:5], *SERIES[6:]), strict=True))
+_BUDGET |= {"first harmonic": SERIES[2], "second harmonic": SERIES[5], "load": SERIES[3], "other": NEUTRAL}
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,7 +202,7 @@ def efforts_plot(efforts: Efforts, name: str = "efforts", *, time: bool = True) 
         last = j == arm.num_joints - 1
         title = _title(efforts, j)
         panels.append(Panel(title, marks, "", f"effort [{unit}]", height=150, x_ticks=False))
-        panels.append(Panel("", residuals, x_label if last else "", f"residual [{unit}]", height=80, x_ticks=last))
+        panels.append(Panel("", residuals, x_label if last else "", f"residual [{unit}]", height=100, x_ticks=last))
     caption = "Measured and predicted effort of each joint, and below it measured minus predicted effort"
     if efforts.grid is not None:
         cut_off = efforts.grid.settings.effort_cut_off
@@ -257,7 +253,7 @@ def residuals_plot(efforts: Efforts, name: str = "residuals") -> Plot:
             step = max(step, -(-len(x) // MAX_DOTS))
             centre, mean, deviation = bin_means(x, residual)
             marks: list[Mark] = [
-                Curve("residual", x[::step], residual[::step], LIMIT, "dots"),
+                Curve("residual", x[::step], residual[::step], MEASURED, "dots"),
                 Band("one standard deviation", centre, mean - deviation, mean + deviation, FITTED),
                 Curve("mean", centre, mean, FITTED),
                 Guide("y", 0.0, None, NEUTRAL, dashed=False),
