@@ -79,6 +79,14 @@ class MotionLimits:
         walls = SoftWalls.of(arm)
         width = np.maximum(self.margin * (upper - lower), walls.width)
         behind_walls = lower + width, upper - width
+        if np.any(covered := 2 * width >= upper - lower):
+            i, names = int(np.argmax(covered)), [*arm.joint_names, *(limit.name for limit in arm.coupled_limits)]
+            raise ExcitationError(
+                f"{arm.name}: no motion meets all limits: the soft wall of the guard covers the whole range of "
+                f"{names[i]}, because its gain kp is small for its effort limit. State gains with a kp "
+                f"{4 * width[i] / (upper[i] - lower[i]):.2g} times as large, or a smaller effort limit, in an arm file "
+                "(dvrk-drake arm-file)"
+            )
         inset = self.margin * (upper - lower)
         lower, upper = lower + inset, upper - inset
         n = arm.num_joints

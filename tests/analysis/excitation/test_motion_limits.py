@@ -139,3 +139,10 @@ def test_wrong_limits_are_rejected(change, message):
     with pytest.raises(ExcitationError) as error:
         replace(LIMITS, **change).of_arm(load_arm("psm"))
     assert message in str(error.value)
+
+
+def test_gain_too_small_for_the_wall_of_the_guard():
+    arm = load_arm("psm")
+    soft = replace(arm, gains=replace(arm.gains, kp=[arm.gains.kp[0] / 100, *arm.gains.kp[1:]]))
+    with pytest.raises(ExcitationError, match=r"soft wall of the guard covers the whole range of yaw.* State gains"):
+        LIMITS.of_arm(soft)
