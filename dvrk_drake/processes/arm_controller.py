@@ -163,7 +163,9 @@ class ArmController:
         builder = DiagramBuilder()
         self.arm, self.period = arm, period
         self._link, self.style = _Exchange(arm), MotionStyle.of_efforts(arm)
-        station = builder.AddSystem(HardwareArmStation(arm, driver=DvrkDriver(status_period=period), link=self._link))
+        driver = DvrkDriver()
+        driver.status_period = period  # measured, and thus not limited to the range of the configuration
+        station = builder.AddSystem(HardwareArmStation(arm, driver=driver, link=self._link))
         self._mode = mode if isinstance(mode, str) else None
         own = (
             mode

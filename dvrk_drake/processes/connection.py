@@ -296,11 +296,7 @@ class ArmConnection:
         if self.transport == "lcm":
             controller, link = self._start("hold")
             (first, *_) = approaches(self.arm, remaining[0], settings, controller.style)
-            try:
-                self._check_path(link, remaining[0] if first is None else first, pose_environment(poses))
-            except BaseException:
-                link.close()
-                raise
+            _, link = self._check_path(link, remaining[0] if first is None else first, pose_environment(poses))
         else:
             from dvrk_drake.systems.ros.crtk_move_link import connect_move_link
 
@@ -376,11 +372,7 @@ class ArmConnection:
         if violations := motion_violations(motion, self.arm, execution_limits(motion.environment), self.model):
             raise CollectionError(f"{path}: {violations[0]}; design a motion within the limits of {self.arm.name}")
         controller, link = self._start("hold")
-        try:
-            q = self._check_path(link, motion.evaluate([begin]).q[0], motion.environment)
-        except BaseException:
-            link.close()
-            raise
+        q, link = self._check_path(link, motion.evaluate([begin]).q[0], motion.environment)
         speed = REHEARSAL_SPEED if output is None else 1.0
         player = MotionPlayer(
             motion,
@@ -451,9 +443,7 @@ class ArmConnection:
 
         driver = CrtkDriver(domain=self.domain, namespace=self.topic or "", guard=self.guard)
         link = CrtkArmLink(self.arm, driver, report=self.dialog.report, stopped=self.dialog.stopped)
-        end = time.monotonic() + _RATE_WAIT
-        while link.next_status(FIRST_WAIT).fault_text and time.monotonic() < end:
-            pass
+        _settle(link)
         return link
 
     def _control(
@@ -474,20 +464,34 @@ class ArmConnection:
         with closing(link):
             control(link, controller, stopped, show, on_status)
 
-    def _check_path(self, link: ArmLink, q_end: NDArray[np.float64], environment: Environment) -> NDArray[np.float64]:
-        """Checks the straight path in joint space from the present pose to a pose (n,). Returns the present pose (n,).
+    def _check_path(
+        self, link: ArmLink, q_end: NDArray[np.float64], environment: Environment
+    ) -> tuple[NDArray[np.float64], ArmLink]:
+        """Checks the straight path in joint space from the present pose to a pose (n,). An error closes the link.
+
+        Returns:
+            Present pose (n,), and a link without the messages that arrived during the check, which are out of date.
 
         Raises:
             CollectionError: The links would collide on the path, or the motors cannot hold the arm.
             ControllerError: The arm sends no status.
         """
-        q = np.array(link.next_status(SILENCE).position)
-        if obstacle := path_obstacle(self.arm, q, q_end, environment, self.model):
-            raise CollectionError(
-                f"{self.arm.name} cannot move from its present pose to the first pose: {obstacle}. Move the arm by "
-                "hand to another pose first (dvrk-drake control --mode gravity)"
-            )
-        return q
+        try:
+            status = link.next_status(SILENCE)
+            q = np.array(status.position)
+            if obstacle := path_obstacle(self.arm, q, q_end, environment, self.model):
+                raise CollectionError(
+                    f"{self.arm.name} cannot move from its present pose to the first pose: {obstacle}. Move the arm "
+                    "by hand to another pose first (dvrk-drake control --mode gravity)"
+                )
+            if self.transport == "ros":
+                _settle(link)
+                return q, link
+        except BaseException:
+            link.close()
+            raise
+        link.close()
+        return q, self._lcm_link(status)
 
     @contextlib.contextmanager
     def _observer(self) -> Iterator[Callable[[float], lcmt_dvrk_status]]:
@@ -501,6 +505,13 @@ class ArmConnection:
 
             observer = CrtkObserver(ros, self.arm, self.topic, self.dialog.report, self.dialog.stopped)
             yield observer.next_status
+
+
+def _settle(link: ArmLink) -> None:
+    """Waits until a guard in this process accepts efforts: the rate of the measurements is known, no step was late."""
+    end = time.monotonic() + _RATE_WAIT
+    while link.next_status(FIRST_WAIT).fault_text and time.monotonic() < end:
+        pass
 
 
 def connect(

@@ -22,11 +22,12 @@ def simulated(monkeypatch):
     arm = load_arm("mtml")
     what = SimpleNamespace(stopped=lambda sticky: False, off_at=None, arms=[])
 
+    opened = SimpleNamespace(next_status=lambda _: what.arms[-1].status(), close=lambda: None)
+
     def start(connection, mode):
         connection.ready()
         controller = ArmController(arm, IdentifiedModel.from_arm(arm), mode, PERIOD)
         what.arms.append(StickyArm(arm, IdentifiedModel.from_arm(arm), np.zeros(7), near_poses()[0]))
-        opened = SimpleNamespace(next_status=lambda _: what.arms[-1].status(), close=lambda: None)
         return controller, opened
 
     def control(link, controller, stopped, report, on_status):
@@ -37,6 +38,7 @@ def simulated(monkeypatch):
             sticky.step(controller.answer(status, time, on_status(status, time)))
 
     monkeypatch.setattr("dvrk_drake.processes.connection.ArmConnection._start", start)
+    monkeypatch.setattr("dvrk_drake.processes.connection.ArmConnection._lcm_link", lambda *_: opened)
     monkeypatch.setattr("dvrk_drake.processes.connection.control", control)
     monkeypatch.setattr(
         "dvrk_drake.processes.simulated_arm.stop_on_signals", lambda: lambda: what.stopped(what.arms[-1])
