@@ -1,9 +1,10 @@
 """`dvrk.connect` over ROS 2: measurement, a motion with the guard in this process, and hold."""
 
+import signal
+
 import numpy as np
 import pytest
 from arm_processes import dvrk_drake
-from crtk_conformance import start_simulated_arm
 from ros_publisher import DOMAIN_FILE
 
 import dvrk_drake as dvrk
@@ -19,15 +20,21 @@ ARM = dvrk.load_arm("mtml")
 @pytest.mark.watchdog
 def test_motion_over_ros(tmp_path, monkeypatch):
     monkeypatch.setenv("CYCLONEDDS_URI", DOMAIN_FILE)
-    from dvrk_drake.systems.ros.messages import Empty
+    from dvrk_drake.systems.ros.messages import Empty, OperatingState
 
-    with start_simulated_arm("mtml", "MTML", 500.0) as arm:
-        for word, homed in (("enable", False), ("home", True)):
-            arm.state_command(word)
-            assert arm.domain.wait_until(lambda goal=("ENABLED", homed, False): arm.state() == goal, 20.0)
+    arguments = ("--transport", "ros", "--rate", "500", "--enabled", "--realtime")
+    arm, domain = dvrk_drake("sim-arm", "--arm", "mtml", *arguments), ros.RosDomain(0)
+    try:
+        state, last = domain.subscribe("/MTML/operating_state", OperatingState, depth=100, latched=True), []
+
+        def is_ready():
+            last.extend(message for message, _ in state.take())
+            return bool(last) and last[-1].is_homed and not last[-1].is_busy
+
+        assert domain.wait_until(is_ready, 60.0), arm.output()
         connection = dvrk.connect(ARM, "ros")
         before = connection.measure(0.1)
-        np.testing.assert_allclose(before.q, arm.latest().position, atol=1e-3)
+        assert before.count > 1 and not ARM.limit_violations(before.q, ARM.per_limit(1e-3, 1e-3))
         basis, span = FourierBasis.of(1.0, 2), ARM.position_upper - ARM.position_lower
         coefficients = np.column_stack([before.q, np.outer(0.01 * span, np.ones(2))])
         path = tmp_path / "m.yaml"
@@ -36,6 +43,8 @@ def test_motion_over_ros(tmp_path, monkeypatch):
         process = dvrk_drake(*command)
         assert process.wait() == 0, process.output()
         assert (tmp_path / "m_rehearsal.yaml").exists()
-        holds = arm.domain.subscribe("/MTML/hold", Empty, depth=10)
+        holds = domain.subscribe("/MTML/hold", Empty, depth=10)
         connection.hold()
-        assert arm.domain.wait_until(lambda: bool(holds.take()), 20.0)
+        assert domain.wait_until(lambda: bool(holds.take()), 20.0)
+    finally:
+        arm.end(signal.SIGINT)
