@@ -56,7 +56,7 @@ PHASES = (
     (HELD_UNTIL, "released: gravity compensation only"),
     (RELEASED_UNTIL, "driven home: the controller regulates a motion"),
 )
-COLOURS = "grey arm: identified model     green arm: model of the SDF, not identified"
+COLOURS = "grey: identified model     green: model of the SDF"
 #: Colour of the ghost: that of the model of the SDF in the plots.
 GHOST_COLOUR = Rgba(0.17, 0.67, 0.4, 0.5)
 
