@@ -1,18 +1,24 @@
-"""Releases of a simulated arm with all effects under the gravity compensation of a calibration.
+"""Releases of a simulated arm with all effects, under gravity compensation alone and in mode "guide".
 
-    python benchmarks/calibrated_releases.py CALIBRATION [--releases 200]
+    python benchmarks/calibrated_releases.py CALIBRATION [--releases 200] [--modes gravity guide] [--processes 2]
 
-CALIBRATION is a folder of `dvrk-drake calibrate`. The arm is released at random poses and moves freely for 10 s. A
-release passes if no joint is ever further than 15 mrad (1.5 mm for the insertion) from its release pose. Without an
-approach, the arm is released at rest. With an approach, it first moves to the pose by 0.2 rad (20 mm) in all joints,
-which loads the friction. The models are static.yaml and model.yaml of the calibration, and the exact model. Poses at
-which the exact holding effort exceeds the limit of a motor are omitted, because no model can hold the arm there.
+CALIBRATION is a folder of `dvrk-drake calibrate`, or the name of an arm. The arm is released at random poses and moves
+freely for 10 s. A release passes if no joint is ever further than 15 mrad (1.5 mm for the insertion) or five encoder
+counts from its release pose. An encoder count of the wrist roll of an MTM is 6 mrad. The arm is released at rest, after
+the controller moved it to the pose by 0.2 rad (20 mm) in all joints, or after a hand led it along this motion for 3 s,
+rested for 0.5 s and let go. These motions load the friction.
+
+The models are static.yaml and model.yaml of the calibration, the exact model, and the exact model with all masses
+20 % larger. In the last two models, the cross-validated error is the RMS error of the model at the poses, as `validate`
+would measure it. Poses at which the exact holding effort exceeds the limit of a motor are omitted, because no model can
+hold the arm there.
 """
 
 from __future__ import annotations
 
 import argparse
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -20,43 +26,80 @@ import numpy as np
 from timing import print_table
 
 import dvrk_drake as dvrk
-from dvrk_drake.experiments.reproduction.drift_experiment import BAND, Drifts, Release, release_all
+from dvrk_drake.experiments.reproduction.drift_experiment import BAND, DURATION, Drifts, Release, release_all
+
+APPROACHES = {"none": "at rest", "regulated": "after an approach", "hand": "after a hand"}
+
+#: Factor of the base parameters in the wrong model.
+WRONG = 1.2
+
+#: Encoder counts by which a held joint may move. The controller does not notice a smaller motion in time.
+COUNTS = 5.0
+
+
+def with_error(model, true, factor, q):
+    """Returns `model` with base parameters times a factor, and with its RMS error at the poses q in its statistics."""
+    wrong = [replace(parameter, value=factor * parameter.value) for parameter in model.base_parameters]
+    changed = replace(model, base_parameters=wrong)
+    errors = np.sqrt(np.mean((changed.holding_torque(q) - true.holding_torque(q)) ** 2, axis=0))
+    joints = [
+        replace(joint, rms_cross_validation_included=float(max(error, 1e-9)))
+        for joint, error in zip(model.joints, errors, strict=True)
+    ]
+    return replace(changed, joints=joints)
 
 
 def main() -> None:
     """Prints a table of the releases."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("calibration", type=Path, help="folder of a calibration")
+    parser.add_argument("calibration", type=Path, help="folder of a calibration, or name of an arm")
     parser.add_argument("--releases", type=int, default=200, help="number of releases; default: %(default)s")
-    parser.add_argument("--models", nargs="+", default=["static", "model", "exact"], help="models; default: all")
+    parser.add_argument("--models", nargs="+", help="static, model, exact, wrong; default: all that exist")
+    parser.add_argument("--modes", nargs="+", default=["gravity", "guide"], help="modes; default: %(default)s")
+    parser.add_argument("--approaches", nargs="+", default=list(APPROACHES), help="approaches; default: %(default)s")
+    parser.add_argument("--duration", type=float, default=DURATION, help="simulated time [s]; default: %(default)s")
+    parser.add_argument("--processes", type=int, help="number of processes; default: number of cores")
     parser.add_argument("--seed", type=int, default=12345, help="seed of the poses; default: %(default)s")
     options = parser.parse_args()
-    arm = dvrk.IdentifiedModel.load(options.calibration / "static.yaml").arm
+    is_calibrated = options.calibration.is_dir()
+    if is_calibrated:
+        arm = dvrk.IdentifiedModel.load(options.calibration / "static.yaml").arm
+    else:
+        arm = dvrk.load_arm(str(options.calibration))
     true = dvrk.IdentifiedModel.from_arm(arm, arm.effects.position_dependent)
     sampled = arm.sample_poses(4 * options.releases, np.random.default_rng(options.seed), margin=0.05)
     can_hold = np.all(np.abs(true.holding_torque(sampled)) <= arm.effort_limits, axis=1)
     poses = sampled[can_hold][: options.releases]
     print(f"{100 * np.mean(~can_hold):.0f} % of the poses are omitted, because a motor is too weak")
+    band = np.maximum(arm.per_joint(*BAND), COUNTS * arm.encoder_counts())
+    unit = np.where(arm.prismatic, 1e4, 1e3)
     rows = {}
-    with ProcessPoolExecutor() as executor, TemporaryDirectory() as folder:
-        exact = Path(folder) / "exact.yaml"
-        true.save(exact)
-        for name in options.models:
-            path = str(exact if name == "exact" else options.calibration / f"{name}.yaml")
-            for what, with_approach in (("at rest", False), ("after an approach", True)):
-                cases = [
-                    Release(arm.name.lower(), arm, ("all",), path, pose, with_approach=with_approach, seed=k)
-                    for k, pose in enumerate(poses)
-                ]
-                drifts = Drifts(arm, release_all(cases, executor))
-                share = drifts.largest / arm.per_joint(*BAND)
-                rows[f"{name}, {what}"] = [
-                    f"{drifts.num_held} of {len(cases)}",
-                    *(f"{15 * x:.1f}" for x in share.max(axis=0)),
-                ]
+    with ProcessPoolExecutor(options.processes) as executor, TemporaryDirectory() as folder:
+        for name, factor in (("exact", 1.0), ("wrong", WRONG)):
+            with_error(true, true, factor, poses).save(Path(folder) / f"{name}.yaml")
+        for name in options.models or [*(["static", "model"] if is_calibrated else []), "exact", "wrong"]:
+            path = (Path(folder) if name in ("exact", "wrong") else options.calibration) / f"{name}.yaml"
+            for mode in options.modes:
+                for approach in options.approaches:
+                    case = Release(arm.name.lower(), arm, ("all",), str(path), poses[0], mode, approach)
+                    case = replace(case, duration=options.duration)
+                    cases = [replace(case, start=pose, seed=k) for k, pose in enumerate(poses)]
+                    positions = release_all(cases, executor)
+                    largest = Drifts(arm, positions).largest
+                    held = np.all(largest <= band, axis=1)
+                    ripple = np.ptp(positions[:, -50:], axis=1).max(axis=0)  # in the last second
+                    rows[f"{name}, {mode}, {APPROACHES[approach]}"] = [
+                        f"{np.count_nonzero(held)} of {len(cases)}",
+                        f"{15 * np.median((largest / band).max(axis=1)):.1f}",
+                        *(f"{x:.1f}" for x in unit * largest.max(axis=0)),
+                        f"{(unit * ripple).max():.2f}",
+                    ]
+                    print(f"{name}, {mode}, {APPROACHES[approach]}:", *rows[f"{name}, {mode}, {APPROACHES[approach]}"])
     headings = [
-        "within 15 mrad",
+        "held",
+        "median of the largest joint [1/15 of the band]",
         *(f"{name} [{'0.1 mm' if p else 'mrad'}]" for name, p in zip(arm.joint_names, arm.prismatic, strict=True)),
+        "largest motion in the last second [mrad, 0.1 mm]",
     ]
     print_table(f"{arm.name}: releases, and largest distance of each joint from its release pose", headings, rows)
 

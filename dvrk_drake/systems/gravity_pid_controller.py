@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem, ValueProducer
 
@@ -27,9 +27,22 @@ Mode = Literal["hold", "gravity", "damped", "guide"]
 #: joint less within `virtual_friction.REST_TIME`.
 _REST = 0.002, 0.0002
 
+#: Deflection within which a hand breaks a spring of mode "guide" away [rad], [m], if the next two numbers allow it.
+_BREAK_AWAY = 0.02, 0.002
+
+#: Largest change of effort by one encoder count, as a share of the slip effort. The springs of mode "guide" are not
+#: stiffer than that, because the joint would oscillate about the edge of a count.
+_COUNT_SHARE = 0.1
+
+#: Largest ratio of the stiffness of a spring of mode "guide" to the gain Kp. It doubles the bandwidth, so the phase
+#: margin at the delays of the velocity filter and of the messages remains large enough.
+_MAX_STIFFENING = 4.0
+
 #: Distance that a joint cannot move in one period, in addition to three encoder counts and to the measured motion
 #: [rad], [m]. The tolerances are those of the guard for a jump of the position.
 _JUMP = 0.01, 0.001
+
+Vector = NDArray[np.float64]
 
 _MODES: tuple[Mode, ...] = get_args(Mode)
 
@@ -44,11 +57,12 @@ class GravityPidController(LeafSystem):
     slow motion that does not accelerate.
 
     **Guide.** In "guide" mode, virtual dry friction is added to G(q), so the arm stays where a hand leaves it, although
-    G(q) has an error and the friction of the arm relaxes. When a joint has rested for 0.25 s, a spring with the
-    stiffness Kp attaches at its position, without a step of the effort. The spring holds the joint up to its slip
+    G(q) has an error and the friction of the arm relaxes. When a joint has rested for 0.25 s, a spring attaches
+    at its position, without a step of the effort. Its stiffness is Kp, or up to four times as large if it would
+    otherwise deflect by more than 20 mrad. The spring holds the joint up to its slip
     effort. A larger effort of a hand breaks it away, and the joint is free until it rests again. Each spring is
     passive: it returns at most the energy with which the hand deflected it, and dissipates this energy when it breaks
-    away. The damping Kd acts below about 0.1 rad/s, up to the slip effort. All springs detach if a measurement is not
+    away. Below about 0.1 rad/s, damping acts, up to the slip effort. All springs detach if a measurement is not
     valid, if the position jumps, and in all other modes. Their efforts then decay with a time constant of 20 ms.
 
     .. pydrake_system::
@@ -169,11 +183,12 @@ class GravityPidController(LeafSystem):
         self.DeclareStateOutputPort(name="fault", state_index=fault)
         counts = arm.encoder_counts()
         tolerances = arm.per_joint(*_REST) + 1.5 * counts, arm.per_joint(*_JUMP) + 3.0 * counts
+        self._deflection = np.maximum(arm.per_joint(*_BREAK_AWAY), counts / _COUNT_SHARE)
         self._constants = np.array([model.feedforward_scale, limits, *tolerances])
         # Reading one cache entry at each update is faster than reading each parameter.
         self._settings = self.DeclareCacheEntry(
             "settings",
-            ValueProducer(allocate=lambda: AbstractValue.Make((np.zeros((8, n)), 0)), calc=self._calc_settings),
+            ValueProducer(allocate=lambda: AbstractValue.Make((np.zeros((10, n)), 0)), calc=self._calc_settings),
             {self.all_parameters_ticket()},
         )
         holding = model.static_model.with_parameters(model.theta)
@@ -227,7 +242,13 @@ class GravityPidController(LeafSystem):
     def _calc_settings(self, context: Context, settings: AbstractValue) -> None:
         per_joint = [context.get_numeric_parameter(index).get_value() for index in (*self._gains, self._slip)]
         mode = int(context.get_numeric_parameter(self._mode).GetAtIndex(0))
-        settings.set_value((np.vstack([per_joint, self._constants]), mode))
+        settings.set_value((np.vstack([per_joint, self._constants, *self._springs(*per_joint)]), mode))
+
+    def _springs(self, kp: Vector, kd: Vector, ki: Vector, slip: Vector) -> tuple[Vector, Vector]:
+        """Returns the stiffness (n,) and damping (n,) of the springs of mode "guide"."""
+        stiffness = np.clip(slip / self._deflection, kp, _MAX_STIFFENING * kp)
+        ratio = np.divide(stiffness, kp, out=np.ones_like(kp), where=kp > 0)
+        return stiffness, np.sqrt(ratio) * kd
 
     def _make_update(self, holding: HoldingArrays, restart: bool) -> Callable[[Context, DiscreteValues], None]:
         """Returns the handler of an update event.

@@ -47,8 +47,8 @@ def controller_step(
         restart: True for the update at initialization.
         period: Period of the update [s].
         mode: Index into `Mode`.
-        per_joint: Rows (8, n): kp, kd, ki, slip effort, feedforward scale, effort limits, and the tolerances of the
-            rest and of a jump, see `virtual_friction`.
+        per_joint: Rows (10, n): kp, kd, ki, slip effort, feedforward scale and effort limits, then the tolerances of
+            rest and jump and the stiffness and damping of `virtual_friction`.
         model: Model of the holding torque.
         effort, gravity, fault, integral: Results, which the function writes into these arrays. `fault` has one number.
         latched_q: Pose that is regulated if `has_desired` is False; NaN before the first pose.
@@ -57,8 +57,8 @@ def controller_step(
     """
     n = effort.size
     kp, kd, ki, slip, feedforward_scale = per_joint[0], per_joint[1], per_joint[2], per_joint[3], per_joint[4]
-    limit, tolerance, jump = per_joint[5], per_joint[6], per_joint[7]
-    hold, damped, guide = mode == HOLD, mode == DAMPED, mode == GUIDE
+    limit, tolerance, jump, stiffness, damping = per_joint[5], per_joint[6], per_joint[7], per_joint[8], per_joint[9]
+    hold, damped = mode == HOLD, mode == DAMPED
 
     if restart:
         for i in range(n):
@@ -68,11 +68,11 @@ def controller_step(
     for i in range(2 * n):
         faulty |= not abs(state[i]) < IMPLAUSIBLE  # also true for NaN
     effort[:] = 0.0
-    if guide and not faulty:
-        virtual_friction(state[:n], state[n:], last_q, period, kp, kd, slip, tolerance, jump, springs, effort)
-    else:
+    if faulty:
         detach(period, springs, effort)
-    if not faulty:
+    else:
+        q, v, guide = state[:n], state[n:], mode == GUIDE
+        virtual_friction(q, v, last_q, guide, period, stiffness, damping, slip, tolerance, jump, springs, effort)
         for i in range(n):
             last_q[i] = state[i]
     if hold and has_desired:

@@ -25,7 +25,7 @@ NUM_STATES = 4
 
 @compiled
 def virtual_friction(
-    q, v, last_q, period, kp, kd, slip, tolerance, jump, memory, effort
+    q, v, last_q, acts, period, kp, kd, slip, tolerance, jump, memory, effort
 ):  # pragma: no cover - compiled
     """Advances the virtual friction of n joints by one period and subtracts its effort from `effort`.
 
@@ -35,6 +35,7 @@ def virtual_friction(
     Args:
         q, v: Position and velocity (n,) of the joints.
         last_q: Positions (n,) one period ago; NaN if unknown.
+        acts: False if all springs are detached. The rest of the joints is nevertheless observed.
         period: Period [s].
         kp, kd: Stiffness and damping (n,) of the springs.
         slip: Efforts (n,) at which the springs break away. They also limit the efforts of the damping.
@@ -52,6 +53,8 @@ def virtual_friction(
             memory[2 * n + i], memory[3 * n + i] = q[i], 0.0
         else:
             memory[3 * n + i] += period
+        if not acts:
+            memory[i] = np.nan
         deflected = kp[i] * (q[i] - memory[i])
         if abs(deflected) <= slip[i]:
             memory[n + i] = deflected
@@ -59,10 +62,12 @@ def virtual_friction(
             if not np.isnan(memory[i]):
                 memory[i], memory[2 * n + i], memory[3 * n + i] = np.nan, q[i], 0.0
             _decay(i, n, period, kp[i] * step, memory)
-            if memory[3 * n + i] >= REST_TIME and kp[i] > 0.0:
+            if acts and memory[3 * n + i] >= REST_TIME and kp[i] > 0.0:
                 memory[i] = q[i] - memory[n + i] / kp[i]
-        fade = max(1.0 - abs(v[i]) * REST_TIME / (FADE_RATIO * tolerance[i]), 0.0)
-        effort[i] -= memory[n + i] + fade * min(max(kd[i] * v[i], -slip[i]), slip[i])
+        effort[i] -= memory[n + i]
+        if acts:
+            fade = max(1.0 - abs(v[i]) * REST_TIME / (FADE_RATIO * tolerance[i]), 0.0)
+            effort[i] -= fade * min(max(kd[i] * v[i], -slip[i]), slip[i])
 
 
 @compiled

@@ -285,7 +285,7 @@ def test_hysteresis_compensation_holds_arm_after_approach(tmp_path):
     truth, exact = GroundTruth(arm, IdentifiedModel.from_arm(arm), False, ""), tmp_path / "exact.yaml"
     truth.model.save(exact)
     start = ARM.sample_poses(1, np.random.default_rng(10), margin=0.2)[0]
-    case = Release(PAPER_ARM, arm, ("friction",), str(exact), start, with_approach=True, duration=1.5, seed=10)
+    case = Release(PAPER_ARM, arm, ("friction",), str(exact), start, approach="regulated", duration=1.5, seed=10)
     with ThreadPoolExecutor(1) as executor:
         uncompensated, compensated = (
             Drifts(arm, positions[None]).largest[0]

@@ -131,6 +131,26 @@ def test_springs_attach_anew_after_a_fault():
     assert_no_effort(guided.step(Q + 1e-3))
 
 
+def test_springs_attach_at_once_after_a_rest_in_another_mode():
+    guided = Guided()
+    guided.controller.SetMode(guided.context, "gravity")
+    guided.rest()
+    assert_no_effort(guided.step(Q + 1e-3))
+    guided.controller.SetMode(guided.context, "guide")
+    assert_no_effort(guided.step(Q + 1e-3))
+    np.testing.assert_allclose(guided.step(Q + 1e-3 + 0.1 * SLIP / KP), -0.1 * SLIP, atol=1e-12)
+
+
+def test_weak_spring_is_stiffened():
+    guided = Guided()
+    weak = Gains(kp=(KP / 10).tolist(), kd=KD.tolist(), ki=[0.0] * N)  # deflects by 40 mrad, or by 10 at kp x 4
+    guided.controller.SetGains(guided.context, weak)
+    guided.rest()
+    added = guided.step(Q + 0.001)
+    stiffness = SLIP / np.maximum(0.02, 10 * ARM.encoder_counts())
+    np.testing.assert_allclose(added, -0.001 * np.clip(stiffness, KP / 10, 0.4 * KP), atol=1e-12)
+
+
 def test_damping_is_at_most_the_slip_effort_and_ends_with_speed():
     guided = Guided()
     slow, fast = 0.01 * np.ones(N), 2.0 * np.ones(N)
@@ -155,7 +175,7 @@ def test_energy_is_never_created():
     last_effort = np.zeros(n)
     for k in range(250):
         effort[:] = 0.0
-        virtual_friction(q, zeros, last, period, kp, zeros, slip, tolerance, jump, memory, effort)
+        virtual_friction(q, zeros, last, True, period, kp, zeros, slip, tolerance, jump, memory, effort)
         energy = effort**2 / (2 * kp)
         if k:
             step = q - last

@@ -6,11 +6,12 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cache
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import LogVectorOutput, TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 
@@ -31,8 +32,15 @@ SAMPLE_PERIOD = 0.02
 #: Duration of the motion after a release [s]; maximum distance of a held joint from its release position [rad], [m].
 DURATION = 10.0
 BAND = 0.015, 0.0015
-#: Approach to the release pose: distance [rad], [m], duration [s], and settling time at the release pose [s].
-APPROACH, APPROACH_TIME, SETTLING_TIME = (0.2, 0.02), 1.0, 1.0
+#: Distance from which an arm approaches its release pose [rad], [m].
+APPROACH = 0.2, 0.02
+#: Approach to the release pose: none, regulated by the controller, or led by a hand.
+Approach = Literal["none", "regulated", "hand"]
+#: Duration of each approach, and settling time at the release pose [s].
+APPROACH_TIMES: dict[Approach, tuple[float, float]] = {"none": (1.0, 0.0), "regulated": (1.0, 1.0), "hand": (3.0, 0.5)}
+#: Ratios of the stiffness and damping of a hand that leads an arm to the gains of the arm. The hand follows its path
+#: within about 0.01 rad against the friction of the arm, and a larger damping would be unstable at 1 kHz.
+_HAND_STIFFNESS, _HAND_DAMPING = 10.0, 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,9 +53,8 @@ class Release:
         parts: Names of the simulated effects, see `ArmEffects.only`.
         model: Path of the controller's model file.
         start: Release pose (n,) [rad, m]. Without an approach, the presliding springs carry no force at this pose.
-        with_approach: Whether the arm first moves to the pose from a distance of `APPROACH`. This motion loads the
-            presliding springs.
-        damped: Whether the controller damps the motion in addition to compensating gravity (mode "damped").
+        mode: Mode of the controller after the release, and while a hand leads the arm.
+        approach: How the arm moves to the pose, from a distance of `APPROACH`. The motion loads the presliding springs.
         hysteresis_ratio: Compensated share of the wide hysteresis. After an approach, this hysteresis moves the
             released arm back.
         duration: Duration of the motion after the release [s].
@@ -59,8 +66,8 @@ class Release:
     parts: tuple[str, ...]
     model: str
     start: NDArray[np.float64]
-    damped: bool = False
-    with_approach: bool = False
+    mode: Mode = "gravity"
+    approach: Approach = "none"
     hysteresis_ratio: float = 0.0
     duration: float = DURATION
     seed: int = 0
@@ -74,37 +81,57 @@ def release(case: Release) -> NDArray[np.float64]:
     station = ArmStation(arm, plant_arm=case.ground_truth_arm, effects=effects, seed=case.seed)
     builder = DiagramBuilder()
     trajectory = _approach_trajectory(case, arm)
-    controller = GravityPidController(_model(case.model), mode="hold" if case.with_approach else _mode(case))
+    controller = GravityPidController(_model(case.model), mode="hold" if case.approach == "regulated" else case.mode)
     friction = None
     if case.hysteresis_ratio:
         friction = FrictionCompensator(Friction.of_arm(arm), ratio=0.0, hysteresis_ratio=case.hysteresis_ratio)
     add_closed_loop(builder, station, controller, TrajectorySource(trajectory, output_derivative_order=1), friction)
+    start_time = sum(APPROACH_TIMES[case.approach]) if case.approach != "none" else 0.0
+    if case.approach == "hand":
+        hand = builder.AddSystem(_JointHand(arm, trajectory, start_time))
+        builder.Connect(station.GetOutputPort(f"{name}.state_true"), hand.get_input_port())
+        builder.Connect(hand.get_output_port(), station.GetInputPort(f"{name}.effort_disturbance"))
     log = LogVectorOutput(station.GetOutputPort(f"{name}.state_true"), builder, SAMPLE_PERIOD)
     simulator = Simulator(builder.Build())
     context = simulator.get_mutable_context()
     station.SetPositions(station.GetMyMutableContextFromRoot(context), trajectory.value(0.0).ravel())
-    start_time = 0.0
-    if case.with_approach:
-        start_time = APPROACH_TIME + SETTLING_TIME
+    if case.approach == "regulated":
         simulator.AdvanceTo(start_time)
-        controller.SetMode(controller.GetMyMutableContextFromRoot(context), _mode(case))
+        controller.SetMode(controller.GetMyMutableContextFromRoot(context), case.mode)
     simulator.AdvanceTo(start_time + case.duration)
     return samples(log, simulator)[round(start_time / SAMPLE_PERIOD) :, : arm.num_joints]
 
 
-def _mode(case: Release) -> Mode:
-    """Returns the mode of the controller after the release."""
-    return "damped" if case.damped else "gravity"
+class _JointHand(LeafSystem):
+    """Hand that leads each joint of an arm along a trajectory with a spring and a damper, and lets go at a time [s]."""
+
+    def __init__(self, arm: Arm, trajectory: PiecewisePolynomial, release_time: float) -> None:
+        super().__init__()
+        self._trajectory, self._velocity = trajectory, trajectory.MakeDerivative()
+        self._stiffness = _HAND_STIFFNESS * np.array(arm.gains.kp)
+        self._damping = _HAND_DAMPING * np.array(arm.gains.kd)
+        self._release_time = release_time
+        self.DeclareVectorInputPort("state_estimated", 2 * arm.num_joints)
+        self.DeclareVectorOutputPort("effort_disturbance", arm.num_joints, self._calc_effort)
+
+    def _calc_effort(self, context: Context, output: BasicVector) -> None:
+        time = min(context.get_time(), self._trajectory.end_time())
+        if context.get_time() >= self._release_time:
+            output.SetZero()
+            return
+        q, v = np.split(self.get_input_port().Eval(context), 2)
+        error, error_rate = self._trajectory.value(time).ravel() - q, self._velocity.value(time).ravel() - v
+        output.SetFromVector(self._stiffness * error + self._damping * error_rate)
 
 
 def _approach_trajectory(case: Release, arm: Arm) -> PiecewisePolynomial:
-    """Returns the trajectory of duration `APPROACH_TIME` to the release pose; it is constant without an approach."""
+    """Returns the trajectory to the release pose; it is constant without an approach."""
     q = first = np.asarray(case.start, float)
-    if case.with_approach:
+    if case.approach != "none":
         sides = np.random.default_rng(case.seed).choice([-1.0, 1.0], arm.num_joints)
         first = offset_pose(arm, q, sides * arm.per_joint(*APPROACH))
     knots = np.column_stack([first, q])
-    return PiecewisePolynomial.CubicHermite([0.0, APPROACH_TIME], knots, np.zeros_like(knots))
+    return PiecewisePolynomial.CubicHermite([0.0, APPROACH_TIMES[case.approach][0]], knots, np.zeros_like(knots))
 
 
 @cache

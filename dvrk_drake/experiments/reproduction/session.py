@@ -16,7 +16,7 @@ from dvrk_drake.analysis.pose_identification import identify_static
 from dvrk_drake.dynamics.friction_compensation import Friction
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.experiments.ground_truth import GroundTruth, collect, paper_arm, perturbed_ground_truth
-from dvrk_drake.experiments.reproduction.drift_experiment import DURATION, Drifts, Release, release_all
+from dvrk_drake.experiments.reproduction.drift_experiment import DURATION, Approach, Drifts, Release, release_all
 from dvrk_drake.experiments.reproduction.published import (
     FIGURE_7_FAULTY,
     PAPER_ARM,
@@ -30,6 +30,7 @@ from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.progress import Progress
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.recordings.writing import write_recording
+from dvrk_drake.systems.gravity_pid_controller import Mode
 
 
 @dataclass(frozen=True)
@@ -129,8 +130,8 @@ class ReproductionSession:
         poses: NDArray[np.float64],
         label: str,
         parts: Sequence[str] = ("all",),
-        damped: bool = False,
-        with_approach: bool = False,
+        mode: Mode = "gravity",
+        approach: Approach = "none",
         hysteresis_ratio: float = 0.0,
         max_duration: float = DURATION,
     ) -> Drifts:
@@ -142,7 +143,7 @@ class ReproductionSession:
             model: Path of the controller's model file.
             poses: Release poses (m, n) [rad, m].
             label: Name of the step for `progress`.
-            parts, damped, with_approach, hysteresis_ratio: See `Release`.
+            parts, mode, approach, hysteresis_ratio: See `Release`.
             max_duration: Maximum duration of each release [s]. `sample_sizes` can reduce it.
         """
         duration = min(self.sample_sizes.duration, max_duration)
@@ -152,8 +153,8 @@ class ReproductionSession:
             tuple(parts),
             str(model),
             poses[0],
-            damped,
-            with_approach,
+            mode,
+            approach,
             hysteresis_ratio,
             duration,
             self.seed,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dvrk_drake.dynamics.friction_compensation import MAX_HYSTERESIS_RATIO
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.experiments.reproduction import published
-from dvrk_drake.experiments.reproduction.drift_experiment import APPROACH, BAND, SAMPLE_PERIOD, SETTLING_TIME, Drifts
+from dvrk_drake.experiments.reproduction.drift_experiment import APPROACH, APPROACH_TIMES, BAND, SAMPLE_PERIOD, Drifts
 from dvrk_drake.experiments.reproduction.published import PAPER_ARM
 from dvrk_drake.experiments.reproduction.session import ReproductionSession
 from dvrk_drake.experiments.tuning.model_based import friction
@@ -21,6 +21,7 @@ from dvrk_drake.reports.colours import FITTED, LIMIT, MEASURED, REFERENCE
 from dvrk_drake.reports.page import Plot
 from dvrk_drake.reports.plot import Curve, Guide, Mark, Panel, joint_label, length_unit
 from dvrk_drake.reports.reproduction.page import ResultTable, Section, numbers, share
+from dvrk_drake.systems.gravity_pid_controller import Mode
 
 #: Interval over which a drift rate is averaged [s].
 RATE_TIME = 1.0
@@ -139,7 +140,7 @@ def reproduce_figure_5(session: ReproductionSession) -> Section:
         mtm.file,
         poses[: sample_sizes.hand_guided_releases],
         "Fig. 5: hand-guiding and releasing ours",
-        with_approach=True,
+        approach="regulated",
     )
     hysteresis_compensated = session.release(
         PAPER_ARM,
@@ -147,12 +148,12 @@ def reproduce_figure_5(session: ReproductionSession) -> Section:
         mtm.file,
         poses[: sample_sizes.hand_guided_releases],
         "Fig. 5: hand-guiding and releasing, hysteresis compensated",
-        with_approach=True,
+        approach="regulated",
         hysteresis_ratio=MAX_HYSTERESIS_RATIO,
     )
     other_effects = [name for name in EFFECT_NAMES if name != "friction"]
 
-    def release_without_friction(model: Path, where: NDArray[np.float64], what: str, damped: bool = False) -> Drifts:
+    def release_without_friction(model: Path, where: NDArray[np.float64], what: str, mode: Mode = "gravity") -> Drifts:
         return session.release(
             PAPER_ARM,
             mtm.truth,
@@ -160,13 +161,13 @@ def reproduce_figure_5(session: ReproductionSession) -> Section:
             where,
             f"Fig. 5: no friction, {what}",
             other_effects,
-            damped,
+            mode,
             max_duration=FRICTIONLESS_DURATION,
         )
 
     frictionless_paper = release_without_friction(session.paper_file, few, "the paper's")
     frictionless_ours = release_without_friction(mtm.file, few, "ours")
-    damped = release_without_friction(mtm.file, poses, "ours damped", damped=True)
+    damped = release_without_friction(mtm.file, poses, "ours damped", mode="damped")
     without_friction = {"the paper's": frictionless_paper, "ours": frictionless_ours, "ours with damping": damped}
     what = "all torques on"
     plots = _plots("fig5", what, ours, paper, published.FIGURE_5, published.FIGURE_5_MEANS)
@@ -199,7 +200,7 @@ def reproduce_figure_5(session: ReproductionSession) -> Section:
         "missing spring, as in Fig. 4. The published drifts differ, because the real arm was placed by hand, its "
         "cables have hysteresis, and the friction of the simulated arm was identified on another MTM.",
         f"**Hand-guided**: the arm is moved to the pose from a distance of {APPROACH[0]:g} rad and regulated for "
-        f"{SETTLING_TIME:g} s. This motion loads the presliding springs of the friction. Then ours holds all joints at "
+        f"{APPROACH_TIMES['regulated'][1]:g} s. This motion loads the presliding springs of the friction. Then ours holds all joints at "
         f"{share(hand_guided.num_held, len(hand_guided.positions))} of the poses. Number of failed releases by joint: "
         f"{_any_lost(hand_guided)}. The gravity compensation does not compensate the loaded springs. Hysteresis with a "
         "width of 0.06-0.25 rad pushes joints 2 and 3 back, and less friction remains to resist the model error. "
