@@ -48,21 +48,24 @@ def keygen(*, output: Annotated[str, Parameter(metavar="FILE")]) -> None:
 def control(
     *,
     controlled: CollectedArm,
-    mode: Literal["gravity", "damped", "hold"] = "gravity",
+    mode: Literal["gravity", "damped", "guide", "hold"] = "gravity",
     gains: Annotated[str | None, Parameter(metavar="GAINS.yaml")] = None,
     friction_ratio: Annotated[float, Parameter(metavar="R")] = 0.0,
     hysteresis_ratio: Annotated[float, Parameter(metavar="R")] = 0.0,
     friction_model: Annotated[str | None, Parameter(metavar="MODEL.yaml")] = None,
 ) -> None:
-    """Control an arm: compensate gravity, damp it or hold a pose.
+    """Control an arm: compensate gravity, damp it, guide it or hold a pose.
 
     Args:
-        mode: gravity: compensate gravity. damped: also damp the motion. hold: regulate the current pose.
-        gains: Gains file written by simulate tune, for the modes damped and hold. Default: the gains of the arm file.
-        friction_ratio: Share of friction to compensate in mode gravity, 0 to 0.6. It is reduced if the arm could creep.
-        hysteresis_ratio: Share of the wide hysteresis to compensate in mode gravity, 0 to 0.9.
+        mode: gravity: compensate gravity. damped: also damp the motion. guide: also keep the arm where a hand leaves
+            it. hold: regulate the current pose.
+        gains: Gains file written by simulate tune, for all modes except gravity. Default: the gains of the arm file.
+        friction_ratio: Share of friction to compensate in the modes gravity and guide, 0 to 0.6. It is reduced if the
+            arm could creep.
+        hysteresis_ratio: Share of the wide hysteresis to compensate in the modes gravity and guide, 0 to 0.9.
         friction_model: Model with the friction parameters, identified from a motion. Default: the model of --model.
     """
+    from dvrk_drake.dynamics.slip_effort import is_cross_validated
     from dvrk_drake.processes.connection import Dialog
     from dvrk_drake.processes.live_status import LiveLine, LiveStatus
 
@@ -71,6 +74,11 @@ def control(
         compensator = _friction_compensator(controlled, mode, friction_ratio, hysteresis_ratio, friction_model)
         checked_gains = None if gains is None else _gains(gains, mode, controlled.arm)
         connection = connect_arm(controlled, Dialog(report=lambda line: print(line, flush=True)))
+    if mode == "guide" and not is_cross_validated(connection.model):
+        print_warning(
+            "the error of the model at rest is unknown, because it was not identified from static poses; virtual "
+            "friction holds the arm only up to the dry friction of the arm file"
+        )
     name = connection.arm.name
     line, printed = LiveLine(sys.stderr), [("", "")]
 
@@ -154,7 +162,7 @@ def _gains(path: str, mode: Mode, arm: str) -> Gains:
     from dvrk_drake.models.arm_schema import load_gains
 
     if mode == "gravity":
-        raise ControllerError("--gains requires --mode hold or damped; mode gravity does not use gains")
+        raise ControllerError("--gains requires --mode damped, guide or hold; mode gravity does not use gains")
     gains = load_gains(path)
     if fault := load_arm(arm).gains_fault(gains):
         raise ControllerError(f"{path}: {fault}")
@@ -169,7 +177,7 @@ def _friction_compensator(
     Returns None if both ratios are 0.
 
     Raises:
-        ControllerError: A ratio is out of range, the mode is not gravity, or no suitable model is given.
+        ControllerError: A ratio is out of range, the mode is not gravity or guide, or no suitable model is given.
         ModelError: The model contains no friction or belongs to another arm.
     """
     if ratio == hysteresis_ratio == 0:
@@ -180,9 +188,10 @@ def _friction_compensator(
     from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.systems.friction_compensator import FrictionCompensator
 
-    if mode != "gravity":
+    if mode not in ("gravity", "guide"):
         raise ControllerError(
-            f"--friction-ratio and --hysteresis-ratio require --mode gravity; mode {mode} does not compensate friction"
+            f"--friction-ratio and --hysteresis-ratio require --mode gravity or guide; mode {mode} does not compensate "
+            "friction"
         )
     if controlled.model is None:
         raise ControllerError(

@@ -39,14 +39,16 @@ class ControllerScenario:
     """Controller of the arm in a scenario.
 
     Attributes:
-        mode: Mode of the controller: "hold", "gravity" or "damped".
+        mode: Mode of the controller: "hold", "gravity", "damped" or "guide".
         model: Path of a model file. If empty, the controller uses the model of the SDF.
         compensated_effects: Effects of the arm ("cables", "springs") that are added to the model of the SDF. Not
             allowed together with `model`.
         gains: Gains kp, kd, ki, one number per joint, instead of those of the arm file. In a scenario file, this can be
             the path of a gains file.
-        friction_ratio: Share of the arm's friction that is compensated, in mode "gravity" only; see `check_ratios`.
-        hysteresis_ratio: Share of the wide hysteresis that is compensated, in mode "gravity" only; see `safe_ratios`.
+        friction_ratio: Share of the arm's friction that is compensated, in the modes "gravity" and "guide"; see
+            `check_ratios`.
+        hysteresis_ratio: Share of the wide hysteresis that is compensated, in the modes "gravity" and "guide"; see
+            `safe_ratios`.
         parameter_error: Relative error of the model. Each base parameter is multiplied by a random factor between
             1 - `parameter_error` and 1 + `parameter_error`, drawn with the seed of the scenario.
     """
@@ -190,9 +192,10 @@ class Scenario(ArmConfig):
         if (gains := self.controller.gains) and (fault := arm.gains_fault(gains)):
             raise ScenarioError(f"controller.{fault}")
         for name in ("friction_ratio", "hysteresis_ratio"):
-            if getattr(self.controller, name) and self.controller.mode != "gravity":
+            if getattr(self.controller, name) and self.controller.mode not in ("gravity", "guide"):
                 raise ScenarioError(
-                    f'controller.{name} requires controller.mode "gravity"; the mode is "{self.controller.mode}"'
+                    f'controller.{name} requires controller.mode "gravity" or "guide"; the mode is '
+                    f'"{self.controller.mode}"'
                 )
         if self.targets and self.controller.mode != "hold":
             raise ScenarioError(f'targets require controller.mode "hold"; the mode is "{self.controller.mode}"')

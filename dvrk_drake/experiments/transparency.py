@@ -24,7 +24,7 @@ from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.friction_compensator import FrictionCompensator
-from dvrk_drake.systems.gravity_pid_controller import GravityPidController
+from dvrk_drake.systems.gravity_pid_controller import GravityPidController, Mode
 from dvrk_drake.systems.hand import Grip, Hand, PoseTrajectorySource
 
 #: Sample period of the recorded signals [s].
@@ -44,12 +44,14 @@ class Compensation:
         model: Model of the gravity torque. None for unpowered motors.
         friction_ratio: Requested share of the friction to compensate. `safe_ratios` limits it.
         friction: Friction model. None for the friction of the arm file.
+        mode: Mode of the controller, "gravity" or "guide".
     """
 
     name: str
     model: IdentifiedModel | None = None
     friction_ratio: float = 0.0
     friction: Friction | None = None
+    mode: Mode = "gravity"
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,7 +166,7 @@ def simulate_operator(
     builder = DiagramBuilder()
     station = builder.AddSystem(ArmStation(arm, effects=effects, seed=seed))
     if compensation.model is not None:
-        controller = GravityPidController(compensation.model, mode="gravity")
+        controller = GravityPidController(compensation.model, mode=compensation.mode)
         add_closed_loop(builder, station, controller, friction=_friction(arm, compensation))
     hand = builder.AddSystem(Hand(arm, frame_name, grip))
     handle_path = PiecewisePose.MakeLinear(knots, poses)
@@ -229,4 +231,5 @@ def listed_compensations(arm: Arm, paths: Sequence[str], friction_ratio: float) 
         listed.append(Compensation(name, model))
         if friction_ratio:
             listed.append(Compensation(f"{name}, friction {friction_ratio:g}", model, friction_ratio))
+        listed.append(Compensation(f"{name}, friction {friction_ratio:g}, guide", model, friction_ratio, mode="guide"))
     return listed

@@ -156,9 +156,9 @@ class ArmController:
             mode: Mode of the controller, or a System that replaces the GravityPidController. It has an input port
                 `state_estimated` (2n) and an output port `effort` (n).
             period: Period of the status messages [s].
-            friction: Friction compensator for mode "gravity". It is added to the Diagram. None: friction is not
-                compensated.
-            gains: Gains for the modes "hold" and "damped". None: the gains of `arm` are used.
+            friction: Friction compensator for the modes "gravity" and "guide". It is added to the Diagram. None:
+                friction is not compensated.
+            gains: Gains for all modes except "gravity". None: the gains of `arm` are used.
         """
         builder = DiagramBuilder()
         self.arm, self.period = arm, period

@@ -197,8 +197,8 @@ class ArmConnection:
         Args:
             controller: Mode of a `GravityPidController`, or a System with an input port `state_estimated` (2n) and an
                 output port `effort` (n), for example with a period of 1 ms.
-            gains: Gains for the modes "hold" and "damped". None: the gains of the arm.
-            friction: Friction compensator for mode "gravity". None: friction is not compensated.
+            gains: Gains for all modes except "gravity". None: the gains of the arm.
+            friction: Friction compensator for the modes "gravity" and "guide". None: friction is not compensated.
             report: Function that is called with the live status a few times per second.
 
         Raises:

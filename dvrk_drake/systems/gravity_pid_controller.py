@@ -24,8 +24,8 @@ from dvrk_drake.systems.virtual_friction import NUM_STATES
 Mode = Literal["hold", "gravity", "damped", "guide"]
 
 #: Distance within which a joint is at rest [rad], [m], in addition to 1.5 encoder counts. A hand that rests moves a
-#: joint less within `virtual_friction.REST_TIME`.
-_REST = 0.002, 0.0002
+#: joint less within `virtual_friction.REST_TIME`. A hand that turns back moves it further, and feels no spring.
+_REST = 0.001, 0.0001
 
 #: Deflection within which a hand breaks a spring of mode "guide" away [rad], [m], if the next two numbers allow it.
 _BREAK_AWAY = 0.02, 0.002
@@ -57,13 +57,13 @@ class GravityPidController(LeafSystem):
     slow motion that does not accelerate.
 
     **Guide.** In "guide" mode, virtual dry friction is added to G(q), so the arm stays where a hand leaves it, although
-    G(q) has an error and the friction of the arm relaxes. When a joint has rested for 0.25 s, a spring attaches
-    at its position, without a step of the effort. Its stiffness is Kp, or up to four times as large if it would
-    otherwise deflect by more than 20 mrad. The spring holds the joint up to its slip
-    effort. A larger effort of a hand breaks it away, and the joint is free until it rests again. Each spring is
-    passive: it returns at most the energy with which the hand deflected it, and dissipates this energy when it breaks
-    away. Below about 0.1 rad/s, damping acts, up to the slip effort. All springs detach if a measurement is not
-    valid, if the position jumps, and in all other modes. Their efforts then decay with a time constant of 20 ms.
+    G(q) has an error and the friction of the arm relaxes. When a joint has rested for 0.25 s, a spring attaches at its
+    position, without a step of the effort. Its stiffness is Kp, or up to four times as large if it would otherwise
+    deflect by more than 20 mrad. The spring holds the joint up to its slip effort. A larger effort of a hand breaks it
+    away, and the joint is free until it rests again. Each spring is passive: it returns at most the energy with which
+    the hand deflected it, and dissipates this energy when it breaks away. Damping acts in addition. On a free joint, it
+    acts only below about 12 mrad/s, up to the error of the model. All springs detach if a measurement is not valid, if
+    the position jumps, and in all other modes. Their efforts then decay with a time constant of 20 ms.
 
     .. pydrake_system::
 
@@ -188,7 +188,7 @@ class GravityPidController(LeafSystem):
         # Reading one cache entry at each update is faster than reading each parameter.
         self._settings = self.DeclareCacheEntry(
             "settings",
-            ValueProducer(allocate=lambda: AbstractValue.Make((np.zeros((10, n)), 0)), calc=self._calc_settings),
+            ValueProducer(allocate=lambda: AbstractValue.Make((np.zeros((11, n)), 0)), calc=self._calc_settings),
             {self.all_parameters_ticket()},
         )
         holding = model.static_model.with_parameters(model.theta)
@@ -244,11 +244,14 @@ class GravityPidController(LeafSystem):
         mode = int(context.get_numeric_parameter(self._mode).GetAtIndex(0))
         settings.set_value((np.vstack([per_joint, self._constants, *self._springs(*per_joint)]), mode))
 
-    def _springs(self, kp: Vector, kd: Vector, ki: Vector, slip: Vector) -> tuple[Vector, Vector]:
-        """Returns the stiffness (n,) and damping (n,) of the springs of mode "guide"."""
+    def _springs(self, kp: Vector, kd: Vector, ki: Vector, slip: Vector) -> tuple[Vector, Vector, Vector]:
+        """Returns stiffness and damping of the springs of mode "guide", and the largest damping of a free joint.
+
+        Without the dry friction, the slip effort is the error of the model, which lets a free joint drift.
+        """
         stiffness = np.clip(slip / self._deflection, kp, _MAX_STIFFENING * kp)
         ratio = np.divide(stiffness, kp, out=np.ones_like(kp), where=kp > 0)
-        return stiffness, np.sqrt(ratio) * kd
+        return stiffness, np.sqrt(ratio) * kd, np.maximum(slip - self._arm.dry_friction(), 0.0)
 
     def _make_update(self, holding: HoldingArrays, restart: bool) -> Callable[[Context, DiscreteValues], None]:
         """Returns the handler of an update event.

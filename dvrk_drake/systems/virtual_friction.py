@@ -14,9 +14,9 @@ REST_TIME = 0.25
 #: spring can attach again.
 DECAY_TIME = 0.02
 
-#: Ratio of the speed at which the damping of a moving joint ends to the largest speed of a joint at rest. The damping
-#: stops a joint that drifts because of an error of the model, and a hand that moves the joint does not feel it.
-FADE_RATIO = 10.0
+#: Ratio of the speed at which the damping of a free joint ends to the largest speed of a joint at rest. The damping
+#: stops a joint that begins to drift because of an error of the model. At larger speeds, a hand would feel it.
+FADE_RATIO = 3.0
 
 #: Number of state variables per joint: position at which the spring is attached (NaN: detached), effort of the spring,
 #: reference position of the rest (NaN: unknown), and time since the joint left it.
@@ -25,7 +25,7 @@ NUM_STATES = 4
 
 @compiled
 def virtual_friction(
-    q, v, last_q, acts, period, kp, kd, slip, tolerance, jump, memory, effort
+    q, v, last_q, acts, period, kp, kd, slip, drift, tolerance, jump, memory, effort
 ):  # pragma: no cover - compiled
     """Advances the virtual friction of n joints by one period and subtracts its effort from `effort`.
 
@@ -38,7 +38,8 @@ def virtual_friction(
         acts: False if all springs are detached. The rest of the joints is nevertheless observed.
         period: Period [s].
         kp, kd: Stiffness and damping (n,) of the springs.
-        slip: Efforts (n,) at which the springs break away. They also limit the efforts of the damping.
+        slip: Efforts (n,) at which the springs break away. They also limit the damping of the attached joints.
+        drift: Largest efforts (n,) of the damping of the free joints.
         tolerance: Distances (n,) within which a joint is at rest.
         jump: Distances (n,) that no joint moves in one period.
         memory: State (4 n,), see `NUM_STATES`.
@@ -66,8 +67,10 @@ def virtual_friction(
                 memory[i] = q[i] - memory[n + i] / kp[i]
         effort[i] -= memory[n + i]
         if acts:
-            fade = max(1.0 - abs(v[i]) * REST_TIME / (FADE_RATIO * tolerance[i]), 0.0)
-            effort[i] -= fade * min(max(kd[i] * v[i], -slip[i]), slip[i])
+            most = slip[i]
+            if np.isnan(memory[i]):
+                most = drift[i] * max(1.0 - abs(v[i]) * REST_TIME / (FADE_RATIO * tolerance[i]), 0.0)
+            effort[i] -= min(max(kd[i] * v[i], -most), most)
 
 
 @compiled

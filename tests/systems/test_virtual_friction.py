@@ -29,7 +29,8 @@ class Guided:
 
     def __init__(self, **arguments):
         gains = Gains(kp=KP.tolist(), kd=KD.tolist(), ki=[0.0] * N)
-        self.controller = GravityPidController(MODEL, mode="guide", gains=gains, slip_efforts=SLIP, **arguments)
+        arguments = {"slip_efforts": SLIP, **arguments}
+        self.controller = GravityPidController(MODEL, mode="guide", gains=gains, **arguments)
         self.context = self.controller.CreateDefaultContext()
         self.added = np.zeros(N)
         self.measure(Q)
@@ -151,13 +152,21 @@ def test_weak_spring_is_stiffened():
     np.testing.assert_allclose(added, -0.001 * np.clip(stiffness, KP / 10, 0.4 * KP), atol=1e-12)
 
 
-def test_damping_is_at_most_the_slip_effort_and_ends_with_speed():
-    guided = Guided()
-    slow, fast = 0.01 * np.ones(N), 2.0 * np.ones(N)
-    np.testing.assert_array_less(guided.step(Q, slow), 0.0)
-    np.testing.assert_array_less(-SLIP, guided.added)
-    assert_no_effort(guided.step(Q, fast))
-    np.testing.assert_array_less(0.0, guided.step(Q, -slow))
+def test_damping_of_a_free_joint_covers_the_error_of_the_model_at_low_speed():
+    error = 0.05 * ARM.effort_limits
+    guided = Guided(slip_efforts=ARM.dry_friction() + error)
+    speeds = np.linspace(0.001, 0.05, 50)
+    damping = -np.array([guided.step(Q, v) for v in speeds])
+    assert np.all(damping >= 0) and np.all(damping <= error)
+    np.testing.assert_allclose(damping[0], np.minimum(KD * 0.001, error), rtol=0.2, atol=1e-9)
+    assert_no_effort(guided.step(Q, 2.0))
+    np.testing.assert_array_less(0.0, guided.step(Q, -0.001))
+
+
+def test_damping_of_an_attached_joint_is_at_most_the_slip_effort():
+    guided = Guided().rest()
+    np.testing.assert_allclose(guided.step(Q, 0.01), -np.minimum(0.01 * KD, SLIP), atol=1e-12)
+    np.testing.assert_allclose(guided.step(Q, 100.0), -SLIP, atol=1e-12)
 
 
 def test_energy_is_never_created():
@@ -175,7 +184,7 @@ def test_energy_is_never_created():
     last_effort = np.zeros(n)
     for k in range(250):
         effort[:] = 0.0
-        virtual_friction(q, zeros, last, True, period, kp, zeros, slip, tolerance, jump, memory, effort)
+        virtual_friction(q, zeros, last, True, period, kp, zeros, slip, zeros, tolerance, jump, memory, effort)
         energy = effort**2 / (2 * kp)
         if k:
             step = q - last

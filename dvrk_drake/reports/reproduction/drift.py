@@ -200,10 +200,11 @@ def reproduce_figure_5(session: ReproductionSession) -> Section:
         "missing spring, as in Fig. 4. The published drifts differ, because the real arm was placed by hand, its "
         "cables have hysteresis, and the friction of the simulated arm was identified on another MTM.",
         f"**Hand-guided**: the arm is moved to the pose from a distance of {APPROACH[0]:g} rad and regulated for "
-        f"{APPROACH_TIMES['regulated'][1]:g} s. This motion loads the presliding springs of the friction. Then ours holds all joints at "
-        f"{share(hand_guided.num_held, len(hand_guided.positions))} of the poses. Number of failed releases by joint: "
-        f"{_any_lost(hand_guided)}. The gravity compensation does not compensate the loaded springs. Hysteresis with a "
-        "width of 0.06-0.25 rad pushes joints 2 and 3 back, and less friction remains to resist the model error. "
+        f"{APPROACH_TIMES['regulated'][1]:g} s. This motion loads the presliding springs of the friction. Then ours "
+        f"holds all joints at {share(hand_guided.num_held, len(hand_guided.positions))} of the poses. Number of failed "
+        f"releases by joint: {_any_lost(hand_guided)}. The gravity compensation does not compensate the loaded "
+        "springs. Hysteresis with a width of 0.06-0.25 rad pushes joints 2 and 3 back, and less friction remains to "
+        "resist the model error. "
         "The friction of joint 7 deflects by 15 mrad before it slips. An exact model causes the same drift. The "
         "published drifts of joints 2 and 3, up to 0.13 rad, have a similar size.",
         f"**With compensated hysteresis** (`control --hysteresis-ratio {MAX_HYSTERESIS_RATIO:g}`, exact friction "
