@@ -24,7 +24,7 @@ from dvrk_drake.systems.virtual_friction import NUM_STATES
 Mode = Literal["hold", "gravity", "damped", "guide"]
 
 #: Distance within which a joint is at rest [rad], [m], in addition to 1.5 encoder counts. A hand that rests moves a
-#: joint less within `virtual_friction.REST_TIME`. A hand that turns back moves it further, and feels no spring.
+#: joint less within `virtual_friction.REST_TIME`. A hand that turns back moves it further.
 _REST = 0.001, 0.0001
 
 #: Deflection within which a hand breaks a spring of mode "guide" away [rad], [m], if the next two numbers allow it.

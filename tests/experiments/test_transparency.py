@@ -94,7 +94,12 @@ def test_command_writes_table(tmp_path, capsys, monkeypatch):
     assert main([*arguments, "--output", str(table), "--plots", str(tmp_path / "plots")]) == 0
     with open(table) as stream:
         rows = list(csv.DictReader(stream))
-    assert [row["compensation"] for row in rows] == ["nothing", "ours", "ours, friction 0.5"]
+    assert [row["compensation"] for row in rows] == [
+        "nothing",
+        "ours",
+        "ours, friction 0.5",
+        "ours, friction 0.5, guide",
+    ]
     assert float(rows[0]["rms_force"]) > 1.0 > float(rows[1]["rms_force"])
     assert (tmp_path / "plots/transparency.png").stat().st_size > 10_000
     assert "Smallest interaction force at the handle: " in capsys.readouterr().out

@@ -152,7 +152,7 @@ def test_weak_spring_is_stiffened():
     np.testing.assert_allclose(added, -0.001 * np.clip(stiffness, KP / 10, 0.4 * KP), atol=1e-12)
 
 
-def test_damping_of_a_free_joint_covers_the_error_of_the_model_at_low_speed():
+def test_damping_of_a_free_joint_covers_the_model_error():
     error = 0.05 * ARM.effort_limits
     guided = Guided(slip_efforts=ARM.dry_friction() + error)
     speeds = np.linspace(0.001, 0.05, 50)
