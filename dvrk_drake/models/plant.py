@@ -31,10 +31,19 @@ from dvrk_drake.models.loop_closure import Closure, pin_loop, remove_loop_mimics
 from dvrk_drake.models.plant_tree import PlantTree
 from dvrk_drake.models.sdf_elements import BASE_LINK
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, compose_sdf, read_sdf_facts
+from dvrk_drake.models.soft_walls import wall_stiffness
 
 #: Bandwidth [rad/s] of derived gains, and ratio ki / kp [1/s]: within the 16 to 30 rad/s and 1.2 to 1.5 1/s of the
 #: gains of the MTM, which were tuned in simulation.
 _BANDWIDTH, _INTEGRAL_RATE = 20.0, 1.2
+#: Largest bandwidth [rad/s] of derived gains. A delay of three control periods of 1 ms then costs 10 deg of phase.
+_MAX_BANDWIDTH = 60.0
+#: Largest ratio kd / inertia [1/s] in any pose. At a control period of 1 ms, half of the velocity is then removed in one
+#: period. Twice this ratio would reverse it.
+_MAX_DAMPING_RATE = 500.0
+#: Largest share of the range of a joint that the soft wall of the guard shall cover at each end, since a motion does not
+#: enter the walls. It is twice the margin of a designed motion.
+_WALL_SHARE = 0.1
 #: Prefix of the names of the frames of the dVRK's DH convention: dh_0, dh_1, ..., and those of the linkage.
 DH_PREFIX = "dh_"
 
@@ -298,20 +307,27 @@ def holding_torques(arm: Arm, poses: NDArray[np.float64]) -> NDArray[np.float64]
 
 
 def critically_damped_gains(arm: Arm) -> Gains:
-    """Returns gains with which each joint, moving alone, has the bandwidth `_BANDWIDTH` and is critically damped.
+    """Returns gains with which each joint, moving alone, is critically damped.
 
-    The inertia of a joint is the largest one in random poses, with the rotors of the model. The gains are within the
-    ranges of `Arm.gain_range`.
+    The bandwidth is `_BANDWIDTH`, or larger if the soft wall of the guard would otherwise cover more than `_WALL_SHARE`
+    of the range (`SoftWalls.width`). The inertia of a joint is the largest one in random poses, with the rotors of the
+    model. The gains are within the ranges of `Arm.gain_range`.
     """
     plant = shared_plant(arm)
     context, selector = plant.CreateDefaultContext(), tree_selector(plant, arm)
-    inertia = np.zeros(arm.num_joints)
+    inertias = []
     for q in arm.sample_poses(50, np.random.default_rng(0)):
         set_arm_positions(plant, context, arm, q)
         M = plant.CalcMassMatrix(context)[np.ix_(selector, selector)]
-        inertia = np.maximum(inertia, np.diag(arm.linkage.matrix.T @ M @ arm.linkage.matrix))
-    kp = _BANDWIDTH**2 * inertia
-    gains = {"kp": kp, "kd": 2 * _BANDWIDTH * inertia, "ki": _INTEGRAL_RATE * kp}
+        inertias.append(np.diag(arm.linkage.matrix.T @ M @ arm.linkage.matrix))
+    least, inertia = np.min(inertias, axis=0), np.max(inertias, axis=0)
+    _, lower, upper = arm.limit_matrix()
+    widest = _WALL_SHARE * (upper - lower)
+    kp_of_walls = np.max(wall_stiffness(arm) / widest[:, None], axis=0)
+    largest = np.clip(_MAX_DAMPING_RATE * least / (2 * inertia), _BANDWIDTH, _MAX_BANDWIDTH)
+    bandwidth = np.clip(np.sqrt(kp_of_walls / inertia), _BANDWIDTH, largest)
+    kp = bandwidth**2 * inertia
+    gains = {"kp": kp, "kd": 2 * bandwidth * inertia, "ki": _INTEGRAL_RATE * kp}
     return Gains(**{name: np.clip(values, *arm.gain_range(name)).tolist() for name, values in gains.items()})
 
 

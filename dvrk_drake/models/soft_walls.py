@@ -33,7 +33,17 @@ class SoftWalls(NamedTuple):
         """Returns the walls of an arm."""
         A, _, _ = arm.limit_matrix()
         kp, kd = np.array(arm.gains.kp), np.array(arm.gains.kd)
-        limits = np.array(arm.effort_limits)
-        effort = np.array([max(limits[row != 0] / np.abs(row[row != 0])) for row in A])
         look_ahead = np.array([max((kd / kp)[row != 0]) for row in A])
-        return cls(effort, look_ahead, (2 * effort[:, None] * A**2 / (_WALL_GAIN * kp)).max(axis=1))
+        return cls(_wall_effort(arm), look_ahead, (wall_stiffness(arm) / kp).max(axis=1))
+
+
+def wall_stiffness(arm: Arm) -> NDArray[np.float64]:
+    """Returns the widths of the walls (k, n) times the gain kp of each joint, which do not depend on the gains."""
+    A, _, _ = arm.limit_matrix()
+    return 2 * _wall_effort(arm)[:, None] * A**2 / _WALL_GAIN
+
+
+def _wall_effort(arm: Arm) -> NDArray[np.float64]:
+    A, _, _ = arm.limit_matrix()
+    limits = np.array(arm.effort_limits)
+    return np.array([max(limits[row != 0] / np.abs(row[row != 0])) for row in A])

@@ -13,6 +13,7 @@ from dvrk_drake.analysis.excitation.predicted_effort import PredictedEffort
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_files import is_from_model_file
 from dvrk_drake.models.arm_schema import POSITIONS
 from dvrk_drake.models.environment import Environment
 from dvrk_drake.models.ranges import number_fault, within
@@ -28,6 +29,9 @@ COLLISION_RATE = 50.0
 #: Largest distance between two poses at which a straight path is checked, as a share of each position range.
 #: The tip of a PSM moves by at most 9 mm between such poses (300 random poses).
 PATH_STEP = 0.01
+#: Largest share of a position range at each end for a soft wall of a derived gain, so that half of the range is free. A
+#: model file has no rotors, so the gain of a light joint with a strong motor can be far below that of a real drive.
+MAX_DERIVED_WALL = 0.25
 
 
 @dataclass(frozen=True)
@@ -77,7 +81,10 @@ class MotionLimits:
         """
         A, lower, upper = arm.limit_matrix()
         walls = SoftWalls.of(arm)
-        width = np.maximum(self.margin * (upper - lower), walls.width)
+        wall_width = walls.width
+        if is_from_model_file(arm):
+            wall_width = np.where(wall_width < MAX_DERIVED_WALL * (upper - lower), wall_width, 0.0)
+        width = np.maximum(self.margin * (upper - lower), wall_width)
         behind_walls = lower + width, upper - width
         if np.any(covered := 2 * width >= upper - lower):
             i, names = int(np.argmax(covered)), [*arm.joint_names, *(limit.name for limit in arm.coupled_limits)]

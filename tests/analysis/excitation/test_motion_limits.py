@@ -146,3 +146,4 @@ def test_gain_too_small_for_the_wall_of_the_guard():
     soft = replace(arm, gains=replace(arm.gains, kp=[arm.gains.kp[0] / 100, *arm.gains.kp[1:]]))
     with pytest.raises(ExcitationError, match=r"soft wall of the guard covers the whole range of yaw.* State gains"):
         LIMITS.of_arm(soft)
+    assert LIMITS.of_arm(replace(soft, source="psm.urdf")).speed[0] == LIMITS.of_arm(arm).speed[0]
