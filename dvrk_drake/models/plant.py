@@ -38,11 +38,11 @@ from dvrk_drake.models.soft_walls import wall_stiffness
 _BANDWIDTH, _INTEGRAL_RATE = 20.0, 1.2
 #: Largest bandwidth [rad/s] of derived gains. A delay of three control periods of 1 ms then costs 10 deg of phase.
 _MAX_BANDWIDTH = 60.0
-#: Largest ratio kd / inertia [1/s] in any pose. At a control period of 1 ms, half of the velocity is then removed in one
-#: period. Twice this ratio would reverse it.
+#: Largest ratio kd / inertia [1/s] in any pose. A control period of 1 ms then removes half of the velocity. More than
+#: twice this ratio would reverse it.
 _MAX_DAMPING_RATE = 500.0
-#: Largest share of the range of a joint that the soft wall of the guard shall cover at each end, since a motion does not
-#: enter the walls. It is twice the margin of a designed motion.
+#: Largest share of the range of a joint for the soft wall of the guard at each end, since a motion does not enter the
+#: walls. It is twice the margin of a designed motion.
 _WALL_SHARE = 0.1
 #: Prefix of the names of the frames of the dVRK's DH convention: dh_0, dh_1, ..., and those of the linkage.
 DH_PREFIX = "dh_"
