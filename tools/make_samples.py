@@ -10,6 +10,7 @@ the same files.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -24,7 +25,7 @@ from pydrake.systems.primitives import LogVectorOutput, TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 
 import dvrk_drake as dvrk
-from dvrk_drake.cli.support import Steps, quiet_drake
+from dvrk_drake.cli.support import Steps
 from dvrk_drake.experiments.ground_truth import GroundTruth, collect, perturbed_ground_truth
 from dvrk_drake.experiments.simulation import advance, sample_times, samples
 from dvrk_drake.models.arm import Arm
@@ -112,7 +113,7 @@ def rounded(recording: dvrk.Recording) -> dvrk.Recording:
 
 def main() -> None:
     """Simulates and writes the sample recordings."""
-    quiet_drake()
+    logging.getLogger("drake").setLevel(logging.WARNING)
     SAMPLES_FOLDER.mkdir(exist_ok=True)
     with TemporaryDirectory() as folder, Steps(*SAMPLES) as steps:
         for sample, arm in SAMPLES.items():

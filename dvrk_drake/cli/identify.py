@@ -170,8 +170,8 @@ def validate(
 
     Args:
         require: Exit with code 2 unless each joint with feedforward has at least this verdict.
-        save: Store the verdicts in the model file; dvrk-drake control checks them. With --overwrite, stored verdicts
-            are replaced.
+        save: Store the verdicts in the model file, which dvrk-drake control checks. With
+            --overwrite, stored verdicts are replaced.
     """
 
     results.check(recording, model)

@@ -110,22 +110,28 @@ def _base_parameters(section: DynamicSection, regressor: DynamicRegressor) -> li
     for p in section.base_parameters:
         sdf = _number(nominal[p.name]) if p.name in nominal else ""
         numbers = estimate_cells(p.value, p.standard_error, section.degrees_of_freedom)
-        rows.append((p.name, *numbers, sdf, _unit(p.unit), f"{p.identifiability:.2f}"))
+        rows.append((_breakable(p.name), *numbers, sdf, _unit(p.unit), f"{p.identifiability:.2f}"))
     count = sum(p.identifiability >= MIN_IDENTIFIABILITY for p in section.base_parameters)
     caption = f"{count} of {len(rows)} base parameters of the dynamics are identifiable from this motion"
     note = (
-        "Identifiability: reduction of the variance relative to the prior, from 0 (value of the SDF) to 1 (value of "
-        f"the recording). A parameter counts as identifiable from {MIN_IDENTIFIABILITY:g} on. {_NOTE}"
+        "Share of the recording (identifiability): reduction of the variance relative to the prior, from 0 (value of "
+        f"the SDF) to 1 (value of the recording). A parameter counts as identifiable from {MIN_IDENTIFIABILITY:g} on. "
+        f"{_NOTE}"
     )
-    return [Table(("base parameter", *_HEADER, "identifiability"), rows, caption, note, show="details", folded=True)]
+    header = ("base parameter", *_HEADER, "share of the recording")
+    return [Table(header, rows, caption, note, show="details", folded=True)]
 
 
 def _correlations(section: DynamicSection) -> list[Block]:
     rows: list[tuple[Cell, ...]] = [
-        (p.first, p.second, f"{p.correlation:+.3f}", "difference" if p.correlation > 0 else "sum")
+        (
+            f"{_breakable(p.first)}; {_breakable(p.second)}",
+            f"{p.correlation:+.3f}",
+            "difference" if p.correlation > 0 else "sum",
+        )
         for p in section.correlations
     ]
-    header = ("first", "second", "correlation", "identifiable: weighted")
+    header = ("two parameters", "correlation", "identifiable: weighted")
     caption = "Parameters that are not identifiable separately"
     return [Table(header, rows, caption, show="details", folded=True)] if rows else []
 
@@ -200,8 +206,8 @@ def _effects(
         if is_prismatic(arm, e.coordinate):
             unit = unit.replace("N m", "N").replace("rad", "m")
         numbers = estimate_cells(e.coefficient, e.standard_error, e.degrees_of_freedom)
-        rows.append((e.coordinate, e.kind, f"{e.scale:.3g}" if e.scale else "", *numbers, _unit(unit)))
-    header = ("coordinate", "effect", "scale", "estimate", "95 % interval", "unit")
+        rows.append((f"{e.coordinate} {e.kind}", f"{e.scale:.3g}" if e.scale else "", *numbers, _unit(unit)))
+    header = ("effect of a coordinate", "scale", "estimate", "95 % interval", "unit")
     scales: dict[str, list[str]] = {}
     for kind in sorted({e.kind for e in effects}):
         scales.setdefault(EFFECT_KINDS[kind].scale or "", []).append(kind)
@@ -219,6 +225,11 @@ def _all_link_parameters(section: DynamicSection, regressor: DynamicRegressor) -
     ]
     caption = "All inertial parameters of the links, about the origin of the link frame"
     return Table(("link", "parameter", *_HEADER), rows, caption, show="page", folded=True)
+
+
+def _breakable(name: str) -> str:
+    """Returns the name of a parameter with blanks, at which a narrow table can break it."""
+    return name.replace("+", " + ").replace("  ", " ").strip()
 
 
 def _unit(unit: str) -> str:

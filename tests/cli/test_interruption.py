@@ -12,12 +12,18 @@ STUDY = "scenario: psm\nset: [duration=1]\nmeasures: [{kind: drift, time: 1, joi
 #: Mapping from a command to its options and to the function that does the work.
 COMMANDS = {
     "simulate": (["--arm", "psm", "--output", "o.csv", "--plots", "new/p"], "experiments.simulation.simulate"),
-    "transparency": (
+    "simulate transparency": (
         ["--arm", "mtml", "--output", "o.csv", "--plots", "new/p"],
         "experiments.transparency.simulate_operator",
     ),
-    "study": (["study.yaml", "--output", "o.csv", "--plots", "new/p"], "experiments.study.study.run_study_locally"),
-    "tune": (["--arm", "mtml", "--output", "o.yaml", "--plots", "new/p"], "experiments.tuning.tuning.tune_arm"),
+    "simulate study": (
+        ["study.yaml", "--output", "o.csv", "--plots", "new/p"],
+        "experiments.study.study.run_study_locally",
+    ),
+    "simulate tune": (
+        ["--arm", "mtml", "--output", "o.yaml", "--plots", "new/p"],
+        "experiments.tuning.tuning.tune_arm",
+    ),
     "reproduce": (["fig7", "--folder", "new/p"], "reports.reproduction.run.reproduce"),
 }
 
@@ -37,7 +43,7 @@ def interrupted(monkeypatch, tmp_path):
             raise error
 
         monkeypatch.setattr(importlib.import_module(module), function, work)
-        return main([command, *arguments])
+        return main([*command.split(), *arguments])
 
     return run
 

@@ -379,7 +379,9 @@ def test_commands_reject_invalid_options(tmp_path, capsys):
     assert "gains.kp has 1 number; allowed: 7" in error_line(
         capsys, "simulate", "--arm", "mtml", "--set", f"controller.gains={few}"
     )
-    assert "requires --mode hold" in error_line(capsys, "control", "--arm", "mtml", "--gains", str(few))
+    assert "requires --mode damped, guide or hold" in error_line(
+        capsys, "control", "--arm", "mtml", "--gains", str(few)
+    )
 
 
 @pytest.mark.slow

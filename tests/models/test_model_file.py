@@ -13,6 +13,7 @@ from dvrk_drake.export.model_writer import write_model
 from dvrk_drake.models.arm_files import derived_arm_file, load_arm
 from dvrk_drake.models.plant import add_arm, arm_sdf, holding_torques, inverse_dynamics
 from dvrk_drake.models.sdf_model import compose_sdf
+from dvrk_drake.models.soft_walls import SoftWalls
 
 MJCF = """<mujoco model="lever">
   <compiler angle="radian"/>
@@ -56,8 +57,11 @@ def test_urdf_defines_joints_limits_and_gains(crane):
     np.testing.assert_array_equal(arm.prismatic, [False, True, False])
     np.testing.assert_array_equal(arm.position_upper, [2 * np.pi, 0.3, 2.0])
     np.testing.assert_array_equal(arm.effort_limits, [80, 120, 20])
-    # Critical damping: kd^2 = 4 kp M, and kp = w^2 M, so that kd = 2 kp / w.
-    np.testing.assert_allclose(np.array(arm.gains.kd) / arm.gains.kp, 0.1, atol=1e-9)
+    # Critical damping: kd^2 = 4 kp M, and kp = w^2 M, so that kd = 2 kp / w. The wall of the lift needs a larger kp.
+    np.testing.assert_allclose((np.array(arm.gains.kd) / arm.gains.kp)[[0, 2]], 0.1, atol=1e-9)
+    walls = SoftWalls.of(arm).width / (arm.position_upper - arm.position_lower)
+    np.testing.assert_allclose(walls[1], 0.1, atol=1e-9)
+    assert walls[0] < 0.1 and walls[2] < 0.1
     assert load_arm(str(crane)) is arm
 
 

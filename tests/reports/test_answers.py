@@ -211,8 +211,8 @@ def test_answer_comes_first_and_output_fits_80_columns(case):
         answer, _, rest = text.partition("\nNext: ")
         assert re.match(CASES[case][0], " ".join(answer.split())), text
         assert answer.count("\n") < 3 and rest.split("\n")[1] == ""
-        # Findings are not wrapped, so that they can be searched.
-        lines = [line for line in text.splitlines() if not line.startswith(("warning: ", "note: "))]
+        # Findings are not wrapped, so that they can be searched, nor commands, so that they can be copied.
+        lines = [line for line in text.splitlines() if not line.startswith(("warning: ", "note: ", "Next: "))]
         assert max(len(line.rstrip()) for line in lines) <= 80, text
         assert "…" not in text
     assert whole.startswith(short.split("\n\n")[0]) and len(whole) >= len(short)

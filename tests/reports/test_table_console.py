@@ -39,6 +39,6 @@ def test_narrow_terminal_shows_all_numbers(capsys, monkeypatch):
 
 
 def test_wide_terminal_keeps_headings_on_one_line(capsys, monkeypatch):
-    title, heading, row = printed(capsys, monkeypatch, 140)
-    assert title.strip() == "Estimates" and row.startswith(NAME)
+    title, heading, row, empty = printed(capsys, monkeypatch, 140)
+    assert title.strip() == "Estimates" and row.startswith(NAME) and not empty
     assert heading.split("  ")[-1].strip() == "saturation [rad/s]"

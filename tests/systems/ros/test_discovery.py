@@ -123,10 +123,9 @@ def test_names_are_checked_before_the_search():
     "command",
     [
         ["bridge"],
-        ["deadman"],
+        ["bridge", "deadman"],
         ["sim-arm", "--transport", "ros"],
         ["record", "a.mcap", "--transport", "ros"],
-        ["collect", "poses", "p.yaml", "--transport", "ros", "--output", "p.csv"],
     ],
 )
 def test_domain_number_is_checked_first(command, capsys, tmp_path, monkeypatch):
