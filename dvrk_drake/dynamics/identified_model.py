@@ -351,10 +351,12 @@ class IdentifiedModel(_Identified):
         actuators = [] if self.dynamics is None else self.dynamics.actuators
         if not any(a.rms_between_days for a in actuators):
             return f"{text}."
-        shares = ", ".join(f"{100 * a.rms_between_days / a.rms_effort if a.rms_effort else 0.0:.0f}" for a in actuators)
+        shares = [f"{100 * a.rms_between_days / a.rms_effort if a.rms_effort else 0.0:.0f}" for a in actuators]
+        # Many arms have one share for all actuators.
+        stated = shares[0] if len(set(shares)) == 1 else ", ".join(shares)
         return (
             f"{text}, or use the wider intervals for another day. Their assumption: the efforts change between days by "
-            f"{shares} % of the RMS efforts (standard deviations in the arm's files)."
+            f"{stated} % of the RMS efforts (standard deviations in the arm's files)."
         )
 
     def recalibrated(self, dynamics: DynamicSection, recording: str) -> "IdentifiedModel":
