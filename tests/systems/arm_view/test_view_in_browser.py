@@ -8,6 +8,7 @@ from waiting import wait_until
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import set_arm_positions, shared_plant
 from dvrk_drake.systems.arm_view.arm_view import DEGREES, EFFORTS, FRAMES, HOME, NAMES, RANDOM, ArmView
+from dvrk_drake.systems.arm_view.camera import home_position
 from dvrk_drake.systems.arm_view.page import start_meshcat, tracked_url
 
 
@@ -74,7 +75,7 @@ def test_buttons_change_the_view(open_page):
     elbow = view._sliders.names[1]
     assert view.meshcat.GetSliderValue(elbow) == pytest.approx(np.degrees(view._q[1]), abs=0.2)
     click(HOME)
-    np.testing.assert_allclose(view._q, np.clip(0, arm.position_lower, arm.position_upper), rtol=0, atol=0.02)
+    np.testing.assert_allclose(view._q, home_position(arm), rtol=0, atol=0.02)
     for preset in view.overlay.camera_presets[::-1]:
         click(preset)
         page.wait_for(f"viewer.camera.position.length() < {4 if preset == 'whole arm' else 1.5}")
