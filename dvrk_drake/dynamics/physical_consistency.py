@@ -304,11 +304,6 @@ def reached_bounds(parameters: NDArray[np.float64], link: LinkInertia, box: Boun
     return bounds
 
 
-def total_mass_reached(total: float, nominal: float) -> bool:
-    """Returns whether the total mass of all links [kg] is at its bound; `nominal` is the total mass in the SDF."""
-    return abs(total / nominal - 1) > TOTAL_MASS_TOLERANCE - _AT_BOUND
-
-
 def _add_prior(program: MathematicalProgram, z: NDArray, to_link: NDArray[np.float64], link: LinkInertia) -> None:
     floor = least_eigenvalue_bound(link) * np.eye(4)
     # With S0 = L L', Z = L^-1 S L^-T is the identity matrix for S = S0. log det Z differs from log det S only by a

@@ -6,9 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-
-#: Ratio of the 95 % quantile of the magnitude of a normally distributed error to its RMS value.
-_QUANTILE = 1.96
+from dvrk_drake.models.effects_schema import half_width
 
 #: Largest slip effort as a share of the effort limit. The hand of an operator overcomes it easily, and enough effort
 #: remains for gravity and for the soft walls of the guard.
@@ -24,7 +22,7 @@ def slip_effort(model: IdentifiedModel) -> NDArray[np.float64]:
     friction alone.
     """
     arm = model.arm
-    error = _QUANTILE * np.array([joint.rms_cross_validation_included for joint in model.joints])
+    error = np.array([half_width(joint.rms_cross_validation_included, None) for joint in model.joints])
     return np.minimum(error + arm.dry_friction(), MAX_SLIP_SHARE * arm.effort_limits)
 
 

@@ -11,6 +11,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, System
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.errors import ControllerError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.approach import approach_offset
 from dvrk_drake.models.arm import Arm
@@ -112,14 +113,13 @@ class _Exchange(ArmLink):
     def poll(self) -> lcmt_dvrk_status | None:
         return self.status
 
+    def next_status(self, seconds: float) -> lcmt_dvrk_status:
+        if self.status is None:
+            raise ControllerError(f"{self.arm.name}: there is no status yet")
+        return self.status
+
     def send(self, command: lcmt_dvrk_command) -> None:
         self.command = command
-
-    def _handle(self, seconds: float) -> bool:
-        return False
-
-    def _publish(self, data: bytes) -> None:
-        pass
 
 
 class ArmController:

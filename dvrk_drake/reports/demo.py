@@ -106,7 +106,7 @@ def _drift_plot(result: DemoResult) -> Plot:
         margin = 0.05 * (high - low)
         y_range = (low - margin, high + margin)
         panels.append(Panel(joint_label(arm, j), marks, "time since the release [s]", label, y_range=y_range))
-    return Plot("drift", "drift from the release position with both models", panels, columns=2)
+    return Plot("drift", "Drift from the release position with both models", panels, columns=2)
 
 
 def _error_plot(result: DemoResult) -> Plot:

@@ -1,6 +1,7 @@
 """Virtual dry friction of mode "guide": it holds a joint at rest, breaks away, and never creates energy."""
 
 import dataclasses
+from statistics import NormalDist
 
 import numpy as np
 import pytest
@@ -205,7 +206,7 @@ def test_default_slip_effort_covers_the_error_and_the_friction():
     joints = [dataclasses.replace(joint, rms_cross_validation_included=e) for joint, e in statistics]
     model = dataclasses.replace(MODEL, joints=joints)
     assert is_cross_validated(model)
-    np.testing.assert_allclose(slip_effort(model), dry + 1.96 * error, atol=1e-12)
+    np.testing.assert_allclose(slip_effort(model), dry + NormalDist().inv_cdf(0.975) * error, atol=1e-9)
     joints[0] = dataclasses.replace(joints[0], rms_cross_validation_included=10.0)
     assert slip_effort(dataclasses.replace(MODEL, joints=joints))[0] == MAX_SLIP_SHARE * ARM.effort_limits[0]
 

@@ -20,7 +20,8 @@ CUT_OFF, ORDER = 10.0, 4
 #: Largest deviation of the gain from 1, and largest lag [s], of velocities that agree with dq/dt. Half or twice these
 #: values changes no finding on the public recordings.
 GAIN_TOLERANCE, LAG_TOLERANCE = 0.03, 0.004
-#: Smallest RMS speed for a comparison [rad/s, m/s].
+#: Smallest RMS speed for a comparison [rad/s, m/s]. On the public recordings, half or twice the value changes only
+#: warnings on the velocities of joints that are held while another joint moves.
 MIN_SPEED = 1e-3
 #: Duration that is omitted at each end because of filter transients [s], at most a tenth of the motion. Transients
 #: decay by a factor of 2e5 in this time.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Self
 
@@ -51,7 +52,7 @@ class Sample:
     commanded: Vector | None
 
 
-class Check(Part):
+class Check(Part, ABC):
     """Plausibility check of successive samples.
 
     Attributes:
@@ -67,9 +68,9 @@ class Check(Part):
     def begin(self, sample: Sample) -> None:
         """Starts with the first sample, which is not checked. By default, a check has no state."""
 
+    @abstractmethod
     def check(self, sample: Sample) -> Mask:
         """Returns a mask (n,) of the joints whose measurement is implausible in the next sample."""
-        raise NotImplementedError
 
 
 class PositionJump(Check):

@@ -22,8 +22,6 @@ _QUEUE, _MESSAGES_AT_ONCE = 100, 200
 class ArmLink(ABC):
     """Statuses (lcmt_dvrk_status) from one arm and commands (lcmt_dvrk_command) to it. Only the newest status is used.
 
-    A subclass passes each received message to `_receive`.
-
     Attributes:
         arm: Arm whose statuses are received.
         lost: Number of statuses that were sent, but not received.
@@ -31,6 +29,46 @@ class ArmLink(ABC):
 
     #: Place where the statuses arrive, for messages.
     where = ""
+
+    def __init__(self, arm: Arm) -> None:
+        """Creates a link to `arm`."""
+        self.arm, self.lost = arm, 0
+
+    @abstractmethod
+    def close(self) -> None:
+        """Ends the link."""
+
+    @abstractmethod
+    def poll(self) -> lcmt_dvrk_status | None:
+        """Returns the newest status that arrived since the last call, or None."""
+
+    @abstractmethod
+    def next_status(self, seconds: float) -> lcmt_dvrk_status:
+        """Returns the newest status of the session that arrives within `seconds`.
+
+        Raises:
+            DvrkDrakeError: No status arrived.
+        """
+
+    @abstractmethod
+    def send(self, command: lcmt_dvrk_command) -> None:
+        """Sends a command."""
+
+    def now(self) -> float:
+        """Returns the time of the computer's monotonic clock [s]."""
+        return time.monotonic()
+
+    def utime(self, context_time: float) -> int:
+        """Returns the present time of the sender's clock [us]. `context_time` is the time of a Diagram [s]."""
+        return round(1e6 * self.now())
+
+    def release(self) -> bool:
+        """Commands the arm to hold its pose without an answer to a status. Returns False if it needs an answer."""
+        return False
+
+
+class MessageLink(ArmLink):
+    """Link over encoded messages. A subclass passes each received message to `_receive`."""
 
     def __init__(
         self,
@@ -51,15 +89,12 @@ class ArmLink(ABC):
             replays: True to accept statuses of any session and time, for example from a replayed log. Must be False for
                 a controller, because old statuses would determine the commands.
         """
-        self.arm, self.lost, self._replays, self._key = arm, 0, replays, key
+        super().__init__(arm)
+        self._replays, self._key = replays, key
         session = 0 if before is None else before.session_id
         self._filter = StatusFilter(arm.name, arm.num_joints, key, session_id=session)
         self._last: lcmt_dvrk_status | None = None
         self._is_new = False
-
-    @abstractmethod
-    def close(self) -> None:
-        """Ends the link."""
 
     @abstractmethod
     def _handle(self, seconds: float) -> bool:
@@ -68,14 +103,6 @@ class ArmLink(ABC):
     @abstractmethod
     def _publish(self, data: bytes) -> None:
         """Sends an encoded command."""
-
-    def now(self) -> float:
-        """Returns the time of the computer's monotonic clock [s]."""
-        return time.monotonic()
-
-    def utime(self, context_time: float) -> int:
-        """Returns the present time of the sender's clock [us]. `context_time` is the time of a Diagram [s]."""
-        return round(1e6 * self.now())
 
     def poll(self) -> lcmt_dvrk_status | None:
         """Returns the newest status that arrived since the last call, or None."""
@@ -106,10 +133,6 @@ class ArmLink(ABC):
         data = command.encode()
         self._publish(data if self._key is None else self._key.sign(data))
 
-    def release(self) -> bool:
-        """Commands the arm to hold its pose without an answer to a status. Returns False if it needs an answer."""
-        return False
-
     def _receive(self, data: bytes) -> None:
         if self._replays:
             status = decode(lcmt_dvrk_status, data)
@@ -133,7 +156,7 @@ class ArmLink(ABC):
         return f"; ignored: {', '.join(f'{n} {reason}' for reason, n in ignored)}{advice.get(ignored[0][0], '')}"
 
 
-class LcmArmLink(ArmLink):
+class LcmArmLink(MessageLink):
     """Link to an arm over an LCM network."""
 
     def __init__(
@@ -145,7 +168,7 @@ class LcmArmLink(ArmLink):
         before: lcmt_dvrk_status | None = None,
         replays: bool = False,
     ) -> None:
-        """Opens the channels of `arm` on the LCM network `url`; see `ArmLink` for the other arguments."""
+        """Opens the channels of `arm` on the LCM network `url`; see `MessageLink` for the other arguments."""
         super().__init__(arm, key=key, before=before, replays=replays)
         self.where, self._channel = status_channel(arm), command_channel(arm)
         self._lcm = lcm.LCM(url)
@@ -165,14 +188,14 @@ class LcmArmLink(ArmLink):
         self._lcm.publish(self._channel, data)
 
 
-class DrakeLcmArmLink(ArmLink):
+class DrakeLcmArmLink(MessageLink):
     """Link to an arm over a Drake LCM interface, whose `HandleSubscriptions` the caller calls.
 
     The sender's clock is the time of the Diagram, so a simulated network may be faster or slower than real time.
     """
 
     def __init__(self, arm: Arm, network: DrakeLcmInterface, *, key: MessageKey | None = None) -> None:
-        """Subscribes to the statuses of `arm`. See `ArmLink` for `key`."""
+        """Subscribes to the statuses of `arm`. See `MessageLink` for `key`."""
         super().__init__(arm, key=key)
         self.where, self._channel, self._network = status_channel(arm), command_channel(arm), network
         network.Subscribe(self.where, self._receive)

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.systems.lcm.arm_link import ArmLink
+from dvrk_drake.systems.lcm.arm_link import MessageLink
 from dvrk_drake.systems.ros.crtk_bridge import CrtkBridge, connect_bridge
 from dvrk_drake.systems.ros.crtk_driver import CrtkDriver
 from dvrk_drake.systems.ros.open_domain import domain_number
@@ -39,7 +39,7 @@ def _close_earlier(arm: Arm, driver: CrtkDriver) -> None:
             client.domain.close()
 
 
-class CrtkArmLink(ArmLink):
+class CrtkArmLink(MessageLink):
     """Link to an arm on ROS 2. It runs a `CrtkBridge`, whose guard checks the commands, each time it is polled.
 
     If the link is not polled for 50 ms while efforts or positions act, the deadman process publishes `hold`.

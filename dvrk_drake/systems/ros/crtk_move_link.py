@@ -11,7 +11,6 @@ measured efforts are those that hold the arm.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 
 import numpy as np
@@ -97,13 +96,17 @@ class CrtkMoveLink(ArmLink):
         """Leaves the ROS domain."""
         self._client.domain.close()
 
+    def poll(self) -> lcmt_dvrk_status | None:
+        """Returns the measurement that arrived since the last call, or None. See `update` for errors."""
+        return self.update(self.now())
+
     def next_status(self, seconds: float) -> lcmt_dvrk_status:
         """Returns the next measurement. It waits until a measurement arrives or the silence is an error.
 
         Raises:
             CollectionError: The motion must stop.
         """
-        while (status := self.update(time.monotonic())) is None:
+        while (status := self.poll()) is None:
             self._client.domain.wait(_POLL)
         return status
 
@@ -145,12 +148,6 @@ class CrtkMoveLink(ArmLink):
         if not self._client.hold_until_confirmed(_CONFIRMATION):
             self._report(f"{self._client.namespace}: the arm did not confirm hold. PRESS THE STOP BUTTON")
         return True
-
-    def _handle(self, seconds: float) -> bool:
-        return False
-
-    def _publish(self, data: bytes) -> None:
-        raise NotImplementedError("this link does not send encoded commands")
 
     def _update(self, now: float) -> lcmt_dvrk_status | None:
         client = self._client
