@@ -36,6 +36,8 @@ USES = {
     "gravity compensation, hand at 1.5 rad/s": ("mtml", "gravity", 1.5, 0.35, True, 3),
     "gravity compensation, hand into the walls": ("mtml", "gravity", 0.7, 1.05, True, 2),
     "damped, hand at 0.5 rad/s": ("mtml", "damped", 0.5, 0.35, True, 1),
+    "guide, hand at 0.5 rad/s": ("mtml", "guide", 0.5, 0.35, True, 2),
+    "guide, hand at 1.5 rad/s": ("mtml", "guide", 1.5, 0.35, True, 2),
     "PID and gravity, 0.5 rad/s": ("mtml", "effort", 0.5, 0.35, False, 2),
     "PID and gravity, 1.5 rad/s": ("mtml", "effort", 1.5, 0.5, False, 2),
     "positions, 1.5 rad/s": ("mtml", "position", 1.5, 0.5, False, 2),

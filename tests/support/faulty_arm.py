@@ -133,8 +133,8 @@ class FaultyArm:
         """Creates an arm at rest at the start of its path.
 
         Args:
-            use: "effort" (PID and gravity along the path), "gravity" or "damped" (gravity compensation), "position",
-                "hold" (no commands).
+            use: "effort" (PID and gravity along the path), "gravity", "damped" or "guide" (gravity compensation),
+                "position", "hold" (no commands).
             path: PiecewisePolynomial of the joints; a wave of 8 s at 0.5 rad/s by default.
             hand: Whether an operator moves the arm along the path.
         """
@@ -162,7 +162,7 @@ class FaultyArm:
         self.desired = lambda t: np.concatenate([path.value(t), velocity.value(t)]).ravel()
         self.controller = None
         self.on_status = lambda status, time: self.desired(time) if use == "effort" else None
-        if use in ("effort", "gravity", "damped"):
+        if use in ("effort", "gravity", "damped", "guide"):
             self.controller = ArmController(arm, model, "hold" if use == "effort" else use, PERIOD)
         self._use = use
         if hand:
