@@ -6,7 +6,7 @@ from functools import cache
 import pytest
 from repository import ROOT
 
-#: Packages that each package may import, besides itself and `COMMON`. docs/packages.md has a diagram.
+#: Packages that each package may import, besides itself and `COMMON`. CONTRIBUTING.md has a table.
 ALLOWED = {
     "models": set(),
     "recordings": {"models"},

@@ -8,7 +8,7 @@ from dvrk_drake.models.effects_schema import FREEDOMS, DriveEffect
 from dvrk_drake.models.ranges import within
 
 #: Allowed ranges of estimates, standard errors and efforts. They detect wrong units and misplaced decimal points (see
-#: docs/number_ranges.md), and are wide because parameters that a recording does not identify can have any value.
+#: docs/files.md), and are wide because parameters that a recording does not identify can have any value.
 ESTIMATES = within(-1e9, 1e9, "kg, kg m or kg m^2")
 STANDARD_ERRORS = within(0.0, 1e9)
 RMS_EFFORTS = within(0.0, 1e6, "N m or N")

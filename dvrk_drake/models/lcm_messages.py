@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm
 
 #: Version of both message types. The first 8 bytes of a message, its fingerprint, depend on all fields of its type. A
-#: changed field therefore makes a new version. Receivers ignore messages of other versions (docs/versions.md).
+#: changed field therefore makes a new version. Receivers ignore messages of other versions (docs/files.md).
 MESSAGE_VERSION = "1.0"
 #: Minimum and maximum length of a key, and length of a new key [bytes]. The maximum is that of BLAKE2b.
 _MIN_LENGTH, _MAX_LENGTH, _NEW_LENGTH = 16, 64, 32
