@@ -18,7 +18,7 @@ class DvrkDrakeError(Exception):
         ...     dvrk.load_arm("mtmx")
         ... except dvrk.DvrkDrakeError as error:
         ...     print(error)
-        unknown arm "mtmx"; known arms: mtml, mtmr, psm, or the path of a YAML, URDF, SDF or MJCF file
+        unknown arm "mtmx"; known arms: ecm, ecm_si, mtml, mtmr, psm, psm_si, or the path of a YAML, URDF, SDF or MJCF file
     """
 
     findings: tuple[object, ...] = ()

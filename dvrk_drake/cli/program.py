@@ -50,7 +50,7 @@ COMMANDS = model, recordings, identify, excite, export, simulate, demo, simulate
 
 #: Mapping from required options to the accepted values, for the message of a missing option.
 REQUIRED = {
-    "--arm": ": mtml, mtmr, psm, or the path of a YAML, URDF, SDF or MJCF file",
+    "--arm": ": ecm, ecm_si, mtml, mtmr, psm, psm_si, or the path of a YAML, URDF, SDF or MJCF file",
     "--model": ": the model file that identify wrote",
 }
 

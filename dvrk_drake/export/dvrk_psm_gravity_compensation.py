@@ -165,7 +165,7 @@ def _sideways_tilt(gravity: NDArray[np.float64]) -> float:
 
 def is_psm(arm: Arm) -> bool:
     """Returns whether the format supports the arm: a PSM with the links of this package."""
-    return arm.joint_names[:3] == ARM_JOINTS and shared_plant(arm).HasBodyNamed("back_crank_link")
+    return arm.joint_names[:3] == ARM_JOINTS and shared_plant(arm).HasBodyNamed("counterweight_link")
 
 
 def kinematic_compensation(

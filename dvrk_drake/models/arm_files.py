@@ -162,7 +162,7 @@ def has_converted_model(arm: Arm) -> bool:
 def is_package_arm(arm: Arm | str) -> bool:
     """Returns whether an arm, or its name, has the name of an arm of this package."""
     name = arm if isinstance(arm, str) else arm.name
-    # The name in an arm file of this package is the name of the file in capital letters.
+    # The names of the files of this package begin with the name of the arm, e.g. psm_si with PSM. psm exists too.
     return name.upper() in map(str.upper, known_arms())
 
 

@@ -50,7 +50,7 @@ def assert_equal_torque(actual, expected):
     np.testing.assert_array_less(np.abs(actual - expected).max(axis=0), 1e-10 * np.maximum(scale, 1e-6))
 
 
-@pytest.fixture(scope="module", params=["mtml", "mtmr", "psm"])
+@pytest.fixture(scope="module", params=["mtml", "mtmr", "psm", "ecm"])
 def arm(request):
     return load_arm(request.param)
 

@@ -189,7 +189,7 @@ def test_other_commands_read_the_recording(tmp_path, capsys, monkeypatch):
         ("effects=[{coordinate: elbow, kind: offset}]", 'effects[0].coordinate is "elbow"; allowed: actuator.yaw'),
         ("effects=[{coordinate: joint.yaw, kind: viscous}]", 'effects[0].kind is "viscous"; allowed: offset, spring'),
         ("seed=-1", "seed is -1"),
-        ("arm=psm9", 'unknown arm "psm9"; did you mean "psm"? known arms: mtml, mtmr, psm'),
+        ("arm=psm9", 'unknown arm "psm9"; did you mean "psm"? known arms: ecm, ecm_si, mtml, mtmr, psm, psm_si'),
         ("duration", "--set duration: a setting must be key=value"),
         ("start=[0,", "--set start=[0,: invalid YAML"),
     ],

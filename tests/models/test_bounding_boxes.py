@@ -10,11 +10,11 @@ import pytest
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia, link_inertias
 from dvrk_drake.dynamics.physical_consistency import BoundingBox, bounding_boxes, box_margins, reached_bounds
 from dvrk_drake.errors import ArmError
-from dvrk_drake.models.arm_files import load_arm
+from dvrk_drake.models.arm_files import known_arms, load_arm
 from dvrk_drake.models.arm_schema import BoundingShapes, BoxCorners
 
 
-@pytest.mark.parametrize("name", ["mtml", "mtmr", "psm"])
+@pytest.mark.parametrize("name", known_arms())
 def test_links_of_the_sdf_fit_their_boxes(name):
     arm = load_arm(name)
     boxes = bounding_boxes(arm)

@@ -11,7 +11,7 @@ from pydrake.systems.framework import DiagramBuilder
 from repository import ROOT
 
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.arm_files import load_arm
+from dvrk_drake.models.arm_files import known_arms, load_arm
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, package_map, set_arm_positions
 from dvrk_drake.models.sdf_model import MODELS_FOLDER
 
@@ -49,7 +49,7 @@ def positions(plant: MultibodyPlant, arm: Arm, q: np.ndarray) -> tuple[np.ndarra
     return q_plant, index
 
 
-@pytest.mark.parametrize("name", ["mtml", "mtmr", "psm"])
+@pytest.mark.parametrize("name", known_arms())
 def test_drake_parser_and_load_arm_give_the_same_arm(name):
     arm = load_arm(name)
     composed, plain = make_arm_plant(arm), plain_plant(name)
@@ -66,7 +66,7 @@ def test_drake_parser_and_load_arm_give_the_same_arm(name):
         np.testing.assert_allclose(mass, composed.CalcMassMatrix(composed_context)[np.ix_(order, order)], atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["mtml", "mtmr", "psm"])
+@pytest.mark.parametrize("name", known_arms())
 def test_limits_are_those_of_the_arm(name):
     arm, plant = load_arm(name), plain_plant(name)
     for i, joint_name in enumerate(arm.joint_names):
@@ -77,7 +77,7 @@ def test_limits_are_those_of_the_arm(name):
     assert plant.num_actuators() == arm.num_joints
 
 
-@pytest.mark.parametrize("name", ["mtml", "mtmr", "psm"])
+@pytest.mark.parametrize("name", known_arms())
 def test_simulated_links_do_not_collide_and_linkage_follows(name):
     arm = load_arm(name)
     builder = DiagramBuilder()

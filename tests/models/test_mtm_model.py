@@ -213,7 +213,7 @@ def test_transmission_conserves_power(arm):
 
 def test_left_and_right_share_the_mechanism_and_differ_in_limits():
     left, right = load_arm("MTML"), load_arm("mtmr")
-    assert known_arms() == ["mtml", "mtmr", "psm"]
+    assert known_arms() == ["ecm", "ecm_si", "mtml", "mtmr", "psm", "psm_si"]
     np.testing.assert_allclose([left.position_lower[0], left.position_upper[0]], [-0.698132, 1.13446], atol=1e-9)
     np.testing.assert_allclose([right.position_lower[3], right.position_upper[3]], [-1.6580, 3.5779], atol=1e-9)
     np.testing.assert_allclose(
@@ -247,7 +247,7 @@ def test_sampling_fails_if_coupled_limit_is_rarely_met(arm):
 
 
 def test_unknown_arm_lists_the_known_ones():
-    with pytest.raises(ArmError, match='unknown arm "mtm"; known arms: mtml, mtmr, psm'):
+    with pytest.raises(ArmError, match='unknown arm "mtm"; known arms: ecm, ecm_si, mtml, mtmr, psm, psm_si'):
         load_arm("mtm")
 
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from dvrk_share import craig
 
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm_files import load_arm
@@ -19,12 +20,6 @@ TABLE = [
     (-PI / 2, 0, -PI / 2, 0),
     (-PI / 2, 0.0091, -PI / 2, 0),
 ]
-
-
-def craig(alpha, a, theta, d):
-    ca, sa, ct, st = np.cos(alpha), np.sin(alpha), np.cos(theta), np.sin(theta)
-    X_alpha = np.array([[1, 0, 0, a], [0, ca, -sa, 0], [0, sa, ca, 0], [0, 0, 0, 1]])
-    return X_alpha @ np.array([[ct, -st, 0, 0], [st, ct, 0, 0], [0, 0, 1, d], [0, 0, 0, 1]])
 
 
 @pytest.fixture(scope="module")

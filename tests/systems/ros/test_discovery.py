@@ -96,7 +96,7 @@ def test_namespace_of_another_arm_is_refused(arm, topic, other):
         (MTML, "/left_master"),
         (MTML, "/MTMR/MTML"),
         (PSM, "/PSM2"),
-        (PSM, "/ECM"),
+        (PSM, "/ECM_view"),
         (dataclasses.replace(MTML, name="MTML2"), "/MTML"),
         (dataclasses.replace(MTML, name="LEFT"), "/MTML"),
     ],
@@ -106,8 +106,8 @@ def test_other_namespaces_are_accepted(arm, namespace):
     assert search(SubstituteDomain([topic]), arm, namespace) == (topic, [])
 
 
-def test_names_of_the_arms_are_those_of_their_files():
-    assert [load_arm(name).name for name in known_arms()] == [name.upper() for name in known_arms()]
+def test_files_of_arms_have_the_names_of_the_arms():
+    assert all(name.upper().startswith(load_arm(name).name) for name in known_arms())
 
 
 def test_names_are_checked_before_the_search():
