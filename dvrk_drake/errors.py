@@ -17,8 +17,8 @@ class DvrkDrakeError(Exception):
         >>> try:
         ...     dvrk.load_arm("mtmx")
         ... except dvrk.DvrkDrakeError as error:
-        ...     print(error)
-        unknown arm "mtmx"; known arms: ecm, ecm_si, mtml, mtmr, psm, psm_si, or the path of a YAML, URDF, SDF or MJCF file
+        ...     print(str(error).partition(",")[0])
+        unknown arm "mtmx"; known arms: ecm
     """
 
     findings: tuple[object, ...] = ()

@@ -84,7 +84,9 @@ def one_of(title: str, least: int = 1) -> Group:
 Arm = Annotated[
     str,
     Parameter(
-        metavar="ARM", completer=_complete_arm, help="ecm, ecm_si, mtml, mtmr, psm, psm_si, or the path of a YAML, URDF, SDF or MJCF file."
+        metavar="ARM",
+        completer=_complete_arm,
+        help="ecm, ecm_si, mtml, mtmr, psm, psm_si, or the path of a YAML, URDF, SDF or MJCF file.",
     ),
 ]
 Model = Annotated[str, Parameter(metavar="MODEL.yaml", help="Model file, written by identify.")]

@@ -34,7 +34,7 @@ def refused(capsys, *arguments):
         (["identify", "--nonsense"], "Unknown option: --nonsense; see dvrk-drake identify --help"),
         (
             ["identify", "a.csv", "--output", "b.yaml"],
-            "--arm is required: ecm, ecm_si, mtml, mtmr, psm, psm_si, or the path of a YAML, URDF, SDF or MJCF file; see",
+            "--arm is required: ecm, ecm_si, mtml, mtmr, psm, psm_si, or the path of",
         ),
         (["validate", "a.csv"], "--model is required: the model file that identify wrote; see"),
         (["equations", "--arm", __file__], f"{__file__} is not the file of an arm; known arms"),
