@@ -43,6 +43,9 @@ if TYPE_CHECKING:
     from dvrk_drake.systems.arm_view.page import start_meshcat
     from dvrk_drake.systems.closed_loop import add_closed_loop
     from dvrk_drake.systems.gravity_pid_controller import GravityPidController
+    from dvrk_drake.systems.hardware_arm_station import HardwareArmStation
+    from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+    from dvrk_drake.systems.ros.crtk_driver import CrtkDriver
     from dvrk_drake.systems.station import Station
     from dvrk_drake.systems.station_config import load_station_config
     from dvrk_drake.systems.teleoperated_arms import TeleoperatedArms
@@ -54,9 +57,12 @@ _MODULES = {
     "ArmStation": "systems.arm_station",
     "CollectionSettings": "processes.collector",
     "Dialog": "processes.connection",
+    "CrtkDriver": "systems.ros.crtk_driver",
     "DvrkDrakeError": "errors",
+    "DvrkDriver": "systems.lcm.dvrk_driver",
     "Environment": "models.environment",
     "GravityPidController": "systems.gravity_pid_controller",
+    "HardwareArmStation": "systems.hardware_arm_station",
     "IdentifiedModel": "dynamics.identified_model",
     "MotionLimits": "analysis.excitation.motion_limits",
     "PeriodicMotion": "recordings.periodic_motion",
@@ -97,10 +103,13 @@ __all__ = [
     "ArmConnection",
     "ArmStation",
     "CollectionSettings",
+    "CrtkDriver",
     "Dialog",
     "DvrkDrakeError",
+    "DvrkDriver",
     "Environment",
     "GravityPidController",
+    "HardwareArmStation",
     "IdentifiedModel",
     "MotionLimits",
     "PeriodicMotion",

@@ -1,3 +1,7 @@
+# /// script
+# requires-python = ">=3.11"
+# dependencies = ["dvrk_drake"]
+# ///
 """Two master arms, a patient-side arm, a table and a ball in one plant, with one controller per arm, in Meshcat."""
 
 import sys

@@ -17,7 +17,16 @@ from dvrk_drake.recordings.samples import SAMPLES_FOLDER
 pytestmark = pytest.mark.drake_api
 
 EXAMPLES = ROOT / "examples"
-PAGE_SCRIPTS = ["arms_and_table.py", "hold_an_arm.py", "teleoperation.py"]
+#: Scripts that need neither arguments nor another process.
+SCRIPTS = [
+    "01_load_and_view.py",
+    "02_gravity_of_any_robot.py",
+    "05_hold.py",
+    "06_guide.py",
+    "08_own_controller.py",
+    "10_teleoperation.py",
+    "arms_and_table.py",
+]
 
 
 def run(folder, *command):
@@ -34,9 +43,10 @@ def run(folder, *command):
 
 def test_all_scripts_are_tested():
     assert {path.name for path in EXAMPLES.glob("*.py")} == {
-        *PAGE_SCRIPTS,
-        "real_recording.py",
-        "regressor_in_numpy.py",
+        *SCRIPTS,
+        "03_identify.py",
+        "04_validate_on_another_day.py",
+        "09_hardware_station.py",  # tests/udp/test_connect_udp.py
     }
 
 
@@ -47,7 +57,7 @@ def test_scripts_import_only_the_public_api(script):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("script", [*PAGE_SCRIPTS, "regressor_in_numpy.py"])
+@pytest.mark.parametrize("script", SCRIPTS)
 def test_scripts_write_no_files_and_print_no_dead_links(script, tmp_path):
     done = run(tmp_path, script)
     assert done.returncode == 0, done.stderr
@@ -59,7 +69,7 @@ def test_scripts_write_no_files_and_print_no_dead_links(script, tmp_path):
 def test_page_is_served_until_enter_on_a_terminal(tmp_path):
     controller, terminal = pty.openpty()
     process = subprocess.Popen(
-        [sys.executable, EXAMPLES / "hold_an_arm.py"],
+        [sys.executable, EXAMPLES / "05_hold.py"],
         cwd=tmp_path,
         env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])},
         stdin=terminal,
@@ -83,11 +93,13 @@ def test_page_is_served_until_enter_on_a_terminal(tmp_path):
 def test_model_is_written_to_the_given_path(tmp_path):
     poses = tmp_path / "poses.csv"
     shutil.copyfile(SAMPLES_FOLDER / "mtm_poses.csv", poses)
-    assert run(tmp_path, "real_recording.py", "poses.csv").returncode == 0
+    assert run(tmp_path, "03_identify.py", "poses.csv", "mtmr").returncode == 0
     assert list(tmp_path.iterdir()) == [poses]
-    assert run(tmp_path, "real_recording.py", "poses.csv", "own.yaml").returncode == 0
+    assert run(tmp_path, "03_identify.py", "poses.csv", "mtmr", "own.yaml").returncode == 0
     before = (tmp_path / "own.yaml").read_bytes()
     assert IdentifiedModel.load(tmp_path / "own.yaml").arm.name == "MTMR"
-    again = run(tmp_path, "real_recording.py", "poses.csv", "own.yaml")
+    again = run(tmp_path, "03_identify.py", "poses.csv", "mtmr", "own.yaml")
     assert again.returncode == 1 and "already exists" in again.stderr
     assert (tmp_path / "own.yaml").read_bytes() == before
+    validated = run(tmp_path, "04_validate_on_another_day.py", "own.yaml", SAMPLES_FOLDER / "mtm_other_poses.csv")
+    assert validated.returncode == 0 and "good" in validated.stdout

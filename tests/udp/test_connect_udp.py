@@ -1,11 +1,16 @@
-"""`dvrk.connect` over ROS 2: measurement, a motion with the guard in this process, and hold."""
+"""`dvrk.connect` over ROS 2: measurement, a motion with the guard in this process, and hold. A script over LCM."""
 
+import os
 import signal
+import subprocess
+import sys
 
 import numpy as np
 import pytest
-from arm_processes import dvrk_drake
+from arm_processes import LONG_TIMEOUT_DRIVER, dvrk_drake
+from repository import ROOT
 from ros_publisher import DOMAIN_FILE
+from waiting import TIMEOUT
 
 import dvrk_drake as dvrk
 from dvrk_drake.recordings.periodic_motion import FourierBasis, PeriodicMotion
@@ -48,3 +53,17 @@ def test_motion_over_ros(tmp_path, monkeypatch):
         assert domain.wait_until(lambda: bool(holds.take()), 20.0)
     finally:
         arm.end(signal.SIGINT)
+
+
+@pytest.mark.watchdog
+def test_script_controls_an_arm_over_lcm():
+    """Runs examples/09_hardware_station.py."""
+    arm = dvrk_drake("sim-arm", "--arm", "mtml", "--realtime", "--driver", LONG_TIMEOUT_DRIVER)
+    command = [sys.executable, str(ROOT / "examples" / "09_hardware_station.py"), "3"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    try:
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=TIMEOUT, check=False)
+    finally:
+        arm.end(signal.SIGINT)
+    assert done.returncode == 0, done.stderr
+    assert "the efforts of this Diagram acted" in done.stdout, done.stdout + arm.output()

@@ -1,3 +1,7 @@
+# /// script
+# requires-python = ">=3.11"
+# dependencies = ["dvrk_drake"]
+# ///
 """Regulates the pose of a simulated master arm with gravity feedforward and PID, and shows it in Meshcat."""
 
 import sys

@@ -1,3 +1,7 @@
+# /// script
+# requires-python = ">=3.11"
+# dependencies = ["dvrk_drake"]
+# ///
 """Simulates teleoperation: a hand moves a master arm with gravity compensation, and a PSM follows at a scale of 1/3."""
 
 import sys
