@@ -22,10 +22,10 @@ sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 
 from faulty_arm import PERIOD, FaultyArm, wave
 
+from dvrk_drake.analysis.excitation.pose_file import CollectionFile
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes.collector import CollectionSettings, Collector
-from dvrk_drake.recordings.pose_file import CollectionFile
 from dvrk_drake.systems.teleoperation import Teleoperation
 
 #: By use: arm, control, maximum speed [rad/s; 0.1 m/s], amplitude as a share of half of each range, whether a hand

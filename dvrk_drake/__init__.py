@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from dvrk_drake.analysis.check.recording_check import check
     from dvrk_drake.analysis.excitation.design import design_excitation
     from dvrk_drake.analysis.excitation.motion_limits import MotionLimits
+    from dvrk_drake.analysis.excitation.periodic_motion import PeriodicMotion
     from dvrk_drake.analysis.excitation.static_poses import design_poses
     from dvrk_drake.analysis.identification import identify
     from dvrk_drake.analysis.payload import payload
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
     from dvrk_drake.processes.calibration import calibrate
     from dvrk_drake.processes.collector import CollectionSettings
     from dvrk_drake.processes.connection import ArmConnection, Dialog, connect
-    from dvrk_drake.recordings.periodic_motion import PeriodicMotion
     from dvrk_drake.recordings.reading import read_recording
     from dvrk_drake.recordings.recording import Recording
     from dvrk_drake.recordings.samples import write_samples
@@ -65,7 +65,7 @@ _MODULES = {
     "HardwareArmStation": "systems.hardware_arm_station",
     "IdentifiedModel": "dynamics.identified_model",
     "MotionLimits": "analysis.excitation.motion_limits",
-    "PeriodicMotion": "recordings.periodic_motion",
+    "PeriodicMotion": "analysis.excitation.periodic_motion",
     "PlantEffects": "systems.arm_effects.dry_friction",
     "Recording": "recordings.recording",
     "Scenario": "experiments.scenario",

@@ -25,6 +25,7 @@ from motions import true_dynamics
 from public_files import team_array, wpi_rows
 from status_logs import log_bytes, statuses
 
+from dvrk_drake.analysis.excitation.pose_file import CollectionFile, load_poses, save_poses
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import DvrkDrakeError
@@ -40,7 +41,6 @@ from dvrk_drake.models.arm_schema import load_gains
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL
 from dvrk_drake.processes.simulated_arm import load_driver
-from dvrk_drake.recordings.pose_file import CollectionFile, load_poses, save_poses
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.recordings.writing import convert, write_recording

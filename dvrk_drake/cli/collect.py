@@ -193,8 +193,8 @@ def collect_motion(
             raise KeyboardInterrupt
         raise CollectionError(f"{motion}: the motion ended early, at {played.end:.1f} s; run the command again")
     if output is not None:
-        from dvrk_drake.recordings.motion_parts import recorded_parts, useful
-        from dvrk_drake.recordings.periodic_motion import PeriodicMotion
+        from dvrk_drake.analysis.excitation.periodic_motion import PeriodicMotion
+        from dvrk_drake.processes.motion_parts import recorded_parts, useful
 
         parts = recorded_parts(output, connection.arm, PeriodicMotion.load(motion, connection.arm))
         files = " ".join(str(part.path) for part in useful(parts, played.duration))

@@ -14,6 +14,8 @@ from pathlib import Path
 import yaml
 
 from dvrk_drake.analysis.excitation.collisions import CollisionDetector
+from dvrk_drake.analysis.excitation.periodic_motion import PeriodicMotion
+from dvrk_drake.analysis.excitation.pose_file import CollectionFile, load_poses
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import CollectionError
 from dvrk_drake.export.model_export import controller_format
@@ -23,9 +25,7 @@ from dvrk_drake.models.environment import Environment
 from dvrk_drake.models.files import atomic_write, read_text_input
 from dvrk_drake.models.ranges import number_fault, within
 from dvrk_drake.models.typed_yaml import load_typed_yaml
-from dvrk_drake.recordings import motion_parts
-from dvrk_drake.recordings.periodic_motion import PeriodicMotion
-from dvrk_drake.recordings.pose_file import CollectionFile, load_poses
+from dvrk_drake.processes import motion_parts
 
 #: Names of the files in the folder.
 SETTINGS, NOMINAL, STATIC, DYNAMIC = "calibration.yaml", "nominal.yaml", "static.yaml", "model.yaml"

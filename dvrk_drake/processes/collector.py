@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from dvrk_drake.analysis.excitation.pose_file import CollectionFile
 from dvrk_drake.errors import CollectionError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.approach import offset_pose
@@ -16,7 +17,6 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.ranges import number_fault, within
 from dvrk_drake.processes.arm_controller import ArmController, GoalController, MotionStyle
 from dvrk_drake.processes.arm_mover import REST_TIME, SETTLE, ArmMover, Steps
-from dvrk_drake.recordings.pose_file import CollectionFile
 from dvrk_drake.systems.cubic_trajectory import CubicTrajectory
 
 #: Time over which measurements are averaged [s].

@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.excitation.motion_limits import execution_limits, motion_violations, path_obstacle
+from dvrk_drake.analysis.excitation.periodic_motion import PeriodicMotion
+from dvrk_drake.analysis.excitation.pose_file import CollectionFile, load_poses, load_poses_if_any, pose_environment
 from dvrk_drake.analysis.verdict import cross_validated_verdicts, unfit
 from dvrk_drake.dynamics.identified_model import ControlModel, IdentifiedModel
 from dvrk_drake.errors import CollectionError, ControllerError
@@ -22,6 +24,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_schema import Gains
 from dvrk_drake.models.environment import Environment
 from dvrk_drake.models.lcm_messages import MessageKey
+from dvrk_drake.processes import motion_parts
 from dvrk_drake.processes.arm_controller import ArmController, GoalController
 from dvrk_drake.processes.arm_operator import reset_fault, stop_arm
 from dvrk_drake.processes.collector import CollectionSettings, Collector, approaches, summary
@@ -31,9 +34,6 @@ from dvrk_drake.processes.motion_player import REHEARSAL_SPEED, MotionPlayer
 from dvrk_drake.processes.recorder import ArmRecorder, LcmRecorder
 from dvrk_drake.processes.ros_recorder import RosRecorder, bag_path
 from dvrk_drake.processes.teacher import Teacher
-from dvrk_drake.recordings import motion_parts
-from dvrk_drake.recordings.periodic_motion import PeriodicMotion
-from dvrk_drake.recordings.pose_file import CollectionFile, load_poses, load_poses_if_any, pose_environment
 from dvrk_drake.recordings.writer_stream import check_stream_output
 from dvrk_drake.systems.friction_compensator import FrictionCompensator
 from dvrk_drake.systems.gravity_pid_controller import Mode

@@ -8,12 +8,12 @@ from concurrent.futures import Executor, Future, ThreadPoolExecutor, wait
 import numpy as np
 from numpy.typing import NDArray
 
+from dvrk_drake.analysis.excitation.periodic_motion import PeriodicMotion
 from dvrk_drake.errors import CollectionError, DvrkDrakeError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.arm_mover import MAX_TRACKING_ERROR, SETTLE, ArmMover, Steps, TrackingError
-from dvrk_drake.recordings.motion_parts import MotionPartFile
-from dvrk_drake.recordings.periodic_motion import PeriodicMotion
+from dvrk_drake.processes.motion_parts import MotionPartFile
 
 #: Speed of a rehearsal, relative to the motion.
 REHEARSAL_SPEED = 0.2

@@ -16,10 +16,10 @@ from typing import IO
 import numpy as np
 from numpy.typing import NDArray
 
+from dvrk_drake.analysis.excitation.pose_file import load_poses_if_any, same_pose, save_poses
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.processes.arm_controller import ArmController
-from dvrk_drake.recordings.pose_file import load_poses_if_any, same_pose, save_poses
 
 
 class RestDetector:

@@ -1,4 +1,4 @@
-"""Makes recordings from messages sensor_msgs/JointState of ROS bags, of CSV files and of MATLAB files.
+"""Makes recordings from messages sensor_msgs/JointState of ROS bags and of tables.
 
 A dVRK publishes positions in rad (m for a prismatic joint), velocities in rad/s (m/s) and efforts in N m (N), all in
 joint coordinates (https://dvrk.readthedocs.io, CRTK names). A header stamp of 0 marks invalid data.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,6 +20,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.locked_joints import check_held, lock_hint
 from dvrk_drake.recordings.reader_options import FileOptions
 from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.recordings.topic_choice import MEASURED_JS
 
 #: Longest distance in time between a message of the arm and the messages of its jaw [s].
 MAX_JAW_GAP = 0.05
@@ -50,7 +51,10 @@ class JointState(NamedTuple):
 
 
 class JointStates(NamedTuple):
-    """Messages of one topic: joint names, stamps [ns], joint states (m, k), and numbers of the messages."""
+    """Messages of one topic: joint names, stamps [ns], joint states (m, k), and numbers of the messages.
+
+    `label` is the name of these numbers: "message", "line" or "row".
+    """
 
     topic: str
     names: tuple[str, ...]
@@ -60,6 +64,7 @@ class JointStates(NamedTuple):
     tau: NDArray[np.float64] | None
     numbers: NDArray[np.int_]
     notes: tuple[str, ...]
+    label: str = "message"
 
 
 def collect_joint_states(
@@ -68,7 +73,7 @@ def collect_joint_states(
     messages: Iterable[JointState],
     *,
     skip_invalid: bool,
-    item: Callable[[int], str],
+    label: str = "message",
 ) -> JointStates:
     """Returns the messages of a topic in the order of their header stamps.
 
@@ -77,7 +82,7 @@ def collect_joint_states(
         topic: Name of the topic, for messages of errors and notes.
         messages: Messages in the order of the file.
         skip_invalid: Whether to omit and note messages with a number that is not finite.
-        item: Function that returns the text of a number of a message, e.g. "message 3 of /PSM1/measured_js".
+        label: Name of the numbers of messages: "message", "line" or "row".
 
     Raises:
         RecordingError: No message is usable, a message has other joints than the first one, numbers are missing or are
@@ -89,7 +94,7 @@ def collect_joint_states(
     missing: dict[str, list[int]] = {name: [] for name in MESSAGE_BLOCKS}
     unstamped, invalid = 0, 0
     for message in messages:
-        where = f"{path}: {item(message.number)}"
+        where = f"{path}: {label} {message.number} of {topic}"
         if message.stamp == 0:
             unstamped += 1
             continue
@@ -132,28 +137,29 @@ def collect_joint_states(
             notes.append(f"velocities of {topic} not used: {len(absent_in)} of {len(stamps)} messages have none")
         elif absent_in:
             has = next(number for number in numbers if number not in set(absent_in))
-            raise RecordingError(f"{path}: {item(absent_in[0])} has no {name}, but {item(has)} has. Cut the recording.")
+            raise RecordingError(
+                f"{path}: {label} {absent_in[0]} of {topic} has no {name}, but {label} {has} has. Cut the recording."
+            )
     stamp_array, number_array = np.frombuffer(stamps, np.int64), np.frombuffer(numbers, np.int64)
-    order, time_notes = order_in_time(path, f"messages of {topic}", stamp_array, number_array, item)
+    order, time_notes = order_in_time(path, f"messages of {topic}", stamp_array, number_array, label)
     table = {name: np.frombuffer(block).reshape(len(stamps), -1)[order] for name, block in blocks.items()}
     return JointStates(
         *(topic, names, stamp_array[order], table["position"], table.get("velocity"), table.get("effort")),
-        *(number_array[order], (*notes, *time_notes)),
+        *(number_array[order], (*notes, *time_notes), label),
     )
 
 
 def joint_recording(
-    path: Path, arm_states: JointStates, jaw: JointStates | None, options: FileOptions, sha256: str, line_label: str
+    path: Path, arm_states: JointStates, options: FileOptions, sha256: str, jaw: JointStates | None = None
 ) -> Recording:
     """Returns the recording of the joints of an arm, in any order of the joints.
 
     Args:
         path: Path of the file.
         arm_states: Messages of the arm.
-        jaw: Messages of its jaw, which is interpolated linearly at the times of the arm, or None.
         options: Arm (required) and names of its joints in the file.
         sha256: SHA-256 of the file.
-        line_label: Name of the numbers of the messages: "message", "line" or "row".
+        jaw: Messages of its jaw, which is interpolated linearly at the times of the arm, or None.
 
     Raises:
         RecordingError: Joints of the arm are missing, or a locked joint was moved.
@@ -170,7 +176,7 @@ def joint_recording(
     return Recording(
         *(q, tau, qd, 1e-9 * (states.stamps - states.stamps[0]), "joint", str(path), states.numbers, sha256),
         notes=(*notes, *name_notes),
-        line_label=line_label,
+        line_label=arm_states.label,
         times_from="messages",
         file_coordinates="joint",
         arm_name=arm.name,
@@ -231,7 +237,7 @@ def order_in_time(
     what: str,
     stamps: NDArray[np.int64],
     numbers: NDArray[np.int_],
-    item: Callable[[int], str],
+    label: str,
     stamp: str = "header stamp",
 ) -> tuple[NDArray[np.intp], list[str]]:
     """Returns the order (k,) of measurements in time, without repeated times, and notes.
@@ -241,7 +247,7 @@ def order_in_time(
         what: Name of the measurements, e.g. "messages of /PSM1/measured_js".
         stamps: Times (m,) in the order of the file [ns].
         numbers: Numbers (m,) of the measurements in the file.
-        item: Function that returns the text of such a number, e.g. "message 3".
+        label: Name of such a number, e.g. "message".
         stamp: Name of a time.
 
     Raises:
@@ -263,8 +269,8 @@ def order_in_time(
         row = int(np.argmax(set_back))
         before = int(np.argmax(stamps[:row]))
         raise RecordingError(
-            f"{path}: the {stamp} of {item(numbers[row])} is {1e-9 * (latest[row] - stamps[row]):g} s before that of "
-            f"{item(numbers[before])}. Cut the recording where the clock was set, or record again."
+            f"{path}: the {stamp} of {label} {numbers[row]} is {1e-9 * (latest[row] - stamps[row]):g} s before that of "
+            f"{label} {numbers[before]}. Cut the recording where the clock was set, or record again."
         )
     order = np.argsort(stamps, kind="stable")
     order = order[np.concatenate([[True], np.diff(stamps[order]) > 0])]
@@ -329,7 +335,7 @@ def _joint_order(path: Path, topic: str, names: tuple[str, ...], arm: Arm) -> li
         if hint:
             advice += f" {hint}"
         if missing == [arm.separate_joint]:
-            separate = f"{topic.rpartition('/')[0]}/{arm.separate_joint}/measured_js"
+            separate = f"{topic.removesuffix(MEASURED_JS)}{arm.separate_joint}/{MEASURED_JS}"
             advice = f"Record {separate} as well. {hint}".rstrip()
         raise RecordingError(
             f"{path}: {topic} has the joints {', '.join(names)}; {arm.name} also needs {', '.join(missing)}. {advice}"

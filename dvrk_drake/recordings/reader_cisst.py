@@ -10,16 +10,15 @@ from __future__ import annotations
 
 import csv
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from dvrk_drake.errors import RecordingError
-from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import open_input, read_input
-from dvrk_drake.models.locked_joints import check_held
 from dvrk_drake.recordings.csv_rows import CsvFile, read_numbers
-from dvrk_drake.recordings.joint_states import arm_joint_names, order_in_time
+from dvrk_drake.recordings.joint_states import JointStates, joint_recording, order_in_time
 from dvrk_drake.recordings.reader_options import FileOptions, sha256_of
 from dvrk_drake.recordings.recording import Coordinates, Recording
 
@@ -64,55 +63,45 @@ def read_collector(path: Path, options: FileOptions) -> Recording:
     data = path.with_suffix(".csv") if is_description else path
     origin, fields = _read_description(description)
     names = [re.sub(r":\{.*\}$", "", field) for field in fields]
-    separate = f"{arm.separate_joint}/measured_js"
-    signal = _choose_signal(description, fields, options.topic)
-    joints = _member_columns(names, signal, "Position")
-    labels = _joint_labels(data, _member_columns(names, signal, "Name"))
-    jaw = separate if len(joints) == arm.num_joints - 1 and f"{separate}.Position[0]" in names else ""
+    signal, separate = _choose_signal(description, fields, options.topic), f"{arm.separate_joint}/measured_js"
+    signals, labels = [signal], _joint_labels(data, _member_columns(names, signal, "Name"))
+    if len(_member_columns(names, signal, "Position")) == arm.num_joints - 1 and f"{separate}.Position[0]" in names:
+        signals, labels = [signal, separate], [*labels, arm.separate_joint]
+    blocks = {
+        block: [column for part in signals for column in _member_columns(names, part, member)]
+        for block, member in _MEMBERS.items()
+    }
+    blocks = {block: columns for block, columns in blocks.items() if len(columns) == len(blocks["q"])}
     stated = _stated_coordinates(origin, signal)
-    known, name_notes = arm_joint_names(f"{description}: {signal}", labels, arm, options.joints)
-    order = _order(
-        *(description, signal, list(known), len(joints), arm), has_jaw=bool(jaw), is_actuator=stated == "actuator"
-    )
-    blocks = {}
-    for block, member in _MEMBERS.items():
-        columns = _member_columns(names, signal, member)
-        extra = _member_columns(names, jaw, member) if jaw else []
-        if len(columns) == len(joints) and bool(extra) == bool(jaw):
-            blocks[block] = [[*columns, *extra][i] for i in order]
+    if stated == "actuator" or not (labels and all(map(str.isidentifier, labels))):
+        if len(blocks["q"]) != arm.num_joints:
+            raise RecordingError(
+                f"{description}: {signal} has {len(blocks['q'])} joints, but {arm.name} has {arm.num_joints}: "
+                f"{', '.join(arm.joint_names)}"
+            )
+        labels = list(arm.joint_names)
     for block, member in (("t", f"{signal}.Timestamp"), ("valid", f"{signal}.Valid")):
         if member not in names:
             raise RecordingError(f"{description}: has no column {member}; signals of type prmStateJoint have one")
         blocks[block] = [names.index(member)]
-    held = {label: column for label, column in zip(known, joints, strict=False) if label in arm.locked_joints}
-    blocks["held"] = list(held.values())
     file = CsvFile(data, options.progress)
     found = read_numbers(file, names, blocks, skip_invalid=options.skip_invalid, header_name=description.name)
-    t = found.blocks["t"][:, 0]
     valid = found.blocks["valid"][:, 0] != 0
-    notes, usable = [*found.notes, *name_notes], np.flatnonzero(valid)
+    notes, usable = list(found.notes), np.flatnonzero(valid)
     if len(usable) < len(valid):
         notes.append(f"{len(valid) - len(usable)} rows of {signal} omitted: marked invalid")
     if not len(usable):
         raise RecordingError(f"{data}: {signal} has no usable row ({'; '.join(notes)})")
-    stamps = np.round(1e9 * t[usable]).astype(np.int64)
-    in_time, time_notes = order_in_time(
-        data, f"rows of {signal}", stamps, found.lines[usable], lambda line: f"line {line}", "time"
-    )
-    new, notes = usable[in_time], [*notes, *time_notes]
-    check_held(f"{data}: {signal}", list(held), found.blocks["held"][new], arm)
-    quantities = {block: found.blocks[block][new] for block in _MEMBERS if block in blocks}
-    notes.append(f"signal {signal} of {origin}, in {options.coordinates or stated} coordinates")
-    return options.recording(
-        path,
-        quantities | {"t": t[new] - t[new][0]},
-        new,
-        notes=notes,
-        default_coordinates=stated,
-        lines=found.lines[new],
-        sha256=sha256_of(data),
-        times_from="messages",
-    )
+    stamps = np.round(1e9 * found.blocks["t"][usable, 0]).astype(np.int64)
+    in_time, time_notes = order_in_time(data, f"rows of {signal}", stamps, found.lines[usable], "line", "time")
+    rows = usable[in_time]
+    q, qd, tau = (found.blocks[block][rows] if block in blocks else None for block in _MEMBERS)
+    assert q is not None
+    notes += [*time_notes, f"signal {signal} of {origin}, in {options.coordinates or stated} coordinates"]
+    states = JointStates(signal, tuple(labels), stamps[in_time], q, qd, tau, found.lines[rows], tuple(notes), "line")
+    recording = joint_recording(path, states, options, sha256_of(data))
+    coordinates = options.coordinates or stated
+    return replace(recording, coordinates=coordinates, file_coordinates=coordinates)
 
 
 def _read_description(path: Path) -> tuple[str, list[str]]:
@@ -162,33 +151,6 @@ def _joint_labels(path: Path, columns: list[int]) -> list[str]:
         line = file.readline().decode(errors="replace")
     cells = next(csv.reader([line]), [])
     return [cells[column].strip() for column in columns if column < len(cells)]
-
-
-def _order(
-    path: Path, signal: str, labels: list[str], count: int, arm: Arm, *, has_jaw: bool, is_actuator: bool
-) -> list[int]:
-    """Returns the index (n,) of each joint of the arm in the signal.
-
-    The signal has `count` joints. If `has_jaw` is True, the next index is that of the jaw.
-    """
-    if has_jaw:
-        labels, count = [*labels, arm.separate_joint], count + 1
-    if set(arm.joint_names) <= set(labels):
-        return [labels.index(name) for name in arm.joint_names]
-    if set(arm.joint_names) - set(labels) == {arm.separate_joint}:
-        raise RecordingError(
-            f"{path}: {signal} has no {arm.separate_joint}. Collect {arm.separate_joint}/measured_js as well."
-        )
-    if labels and all(label.isidentifier() for label in labels) and not is_actuator:
-        raise RecordingError(
-            f"{path}: {signal} has the joints {', '.join(labels)}, but {arm.name} has {', '.join(arm.joint_names)}. "
-            "Check --arm and --topic."
-        )
-    if count != arm.num_joints:
-        raise RecordingError(
-            f"{path}: {signal} has {count} joints, but {arm.name} has {arm.num_joints}: {', '.join(arm.joint_names)}"
-        )
-    return list(range(count))
 
 
 def _stated_coordinates(origin: str, signal: str) -> Coordinates:

@@ -198,10 +198,8 @@ def _read_messages(
             yield JointState(line, stamp, names, *(numbers(line, cells, name) for name in MESSAGE_BLOCKS))
 
     topic = topic or "JointState messages"
-    states = collect_joint_states(
-        path, topic, messages(), skip_invalid=options.skip_invalid, item=lambda line: f"line {line}"
-    )
-    return joint_recording(path, states, None, options, sha256_of(path), "line")
+    states = collect_joint_states(path, topic, messages(), skip_invalid=options.skip_invalid, label="line")
+    return joint_recording(path, states, options, sha256_of(path))
 
 
 def _elements(cell: str) -> list[str]:

@@ -73,10 +73,8 @@ def read_lerobot(path: Path, options: FileOptions) -> Recording:
             last = row
             yield state
 
-    states = collect_joint_states(
-        path, _QUANTITIES[0], messages(), skip_invalid=options.skip_invalid, item=lambda number: f"row {number}"
-    )
-    return joint_recording(path, states, None, options, sha256_of(info, *files), "row")
+    states = collect_joint_states(path, _QUANTITIES[0], messages(), skip_invalid=options.skip_invalid, label="row")
+    return joint_recording(path, states, options, sha256_of(info, *files))
 
 
 def _joint_names(info: Any) -> list[str]:

@@ -1,18 +1,21 @@
 """Makes recordings from arrays in MATLAB files (version 4 to 7.3) and NumPy archives (.npz).
 
-The arrays q, qd, tau and t are named by the user or recognised by their names. Two public layouts are recognised:
-
-- static poses of WPI (https://github.com/WPI-AIM/dvrk_gravity_comp): one array of 8 x 2 x N. Its dimensions are joint
-  (the eighth is the gripper), quantity (position, effort) and pose;
-- the gravity collection of JHU and CUHK (https://github.com/jhu-dvrk/dvrk-gravity-compensation): a folder of files with
-  `current_position` and `desired_effort`, each joint x pose x sample.
+The arrays q, qd, tau and t are named by the user or recognised by their names. The names also recognise the gravity
+collection of JHU and CUHK (https://github.com/jhu-dvrk/dvrk-gravity-compensation): a folder of files with
+`current_position` and `desired_effort`, each joint x pose x sample. An array of 8 x 2 x N contains static poses of WPI
+(https://github.com/WPI-AIM/dvrk_gravity_comp).
 """
 
 from __future__ import annotations
 
+import io
+import pickle
+import subprocess
+import sys
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +23,20 @@ from numpy.typing import NDArray
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.files import read_input
 from dvrk_drake.recordings.csv_rows import listed
-from dvrk_drake.recordings.joint_states import JointState, collect_joint_states, joint_recording
-from dvrk_drake.recordings.reader_matlab_content import ArrayContent, is_matlab, read_content
 from dvrk_drake.recordings.reader_options import FileOptions, sha256_of
 from dvrk_drake.recordings.recording import Recording
 
 _SUFFIXES = (".mat", ".npz")
+_HDF5_MAGIC, _ZIP_MAGIC = b"\x89HDF\r\n\x1a\n", b"PK\x03\x04"
+#: Program that reads a MATLAB file up to version 7 from its standard input. Damaged files can crash scipy (1.17), so it
+#: runs in another process. "Returned data may be corrupt" becomes an error; scipy calls all objects of classes "None".
+_LOADER = """
+import io, pickle, sys, warnings, scipy.io
+warnings.filterwarnings("error", category=UserWarning)
+warnings.filterwarnings("ignore", 'Duplicate variable name "None"')
+content = scipy.io.loadmat(io.BytesIO(sys.stdin.buffer.read()), simplify_cells=True)
+sys.stdout.buffer.write(pickle.dumps({name: value for name, value in content.items() if name[:2] != "__"}))
+"""
 #: Recognised names of arrays, in lower case. The first names of q and tau are those of the public gravity collection.
 _NAMES = {
     "q": ("current_position", "q", "position", "positions", "measured_position", "joint_position", "joint_positions"),
@@ -36,10 +47,9 @@ _NAMES = {
     ),
     "t": ("t", "time", "times", "timestamp", "timestamps"),
 }
-#: Quantities that the user can name.
-QUANTITIES = tuple(_NAMES)
-#: First dimension of an array of static poses (joints and gripper), and number of joints.
-_POSE_ROWS, _POSE_JOINTS = 8, 7
+#: First dimensions (joints and gripper; position, effort) of an array of static poses, and its number of joints. The
+#: array is allocated before the measurement, so a pose of only zeros was not recorded.
+_POSE_SHAPE, _POSE_JOINTS = (8, 2), 7
 #: Maximum number of arrays listed in a message.
 _LISTED = 12
 
@@ -51,13 +61,12 @@ def is_array_file(path: Path) -> bool:
     if path.suffix.lower() in _SUFFIXES:
         return True
     with path.open("rb") as file:
-        return is_matlab(file.read(520))
+        start = file.read(520)
+    return start[126:128] in (b"IM", b"MI") or _is_hdf5(start)
 
 
 def read_array_file(path: Path, options: FileOptions) -> Recording:
     """Reads a recording from a MATLAB file, a NumPy archive, or all such files of a folder and its subfolders.
-
-    Messages sensor_msgs/JointState in a structure array or cell array of MATLAB are read like a topic of a ROS bag.
 
     An array is m x n, n x m or n x poses x samples, for m rows and n joints. Each sample is one row of the recording.
     Arrays without times contain static poses, unless `options.rate` is given.
@@ -77,24 +86,22 @@ def read_array_file(path: Path, options: FileOptions) -> Recording:
     """
     files = _collection(path) if path.is_dir() else [path]
     names = dict(options.arrays or {})
-    if unknown := set(names) - {*QUANTITIES, "poses"}:
-        raise RecordingError(f"unknown quantity {', '.join(sorted(unknown))}; allowed: {', '.join(QUANTITIES)}, poses")
+    if unknown := set(names) - {*_NAMES, "poses"}:
+        raise RecordingError(f"unknown quantity {', '.join(sorted(unknown))}; allowed: {', '.join(_NAMES)}, poses")
+    if options.rate is not None and len(files) > 1:
+        raise RecordingError(f"{path}: --rate does not apply to a folder; read the motion of one file")
     parts = []
     for number, file in enumerate(files):
         options.progress(number / len(files))
-        contents = read_content(file, read_input(file, RecordingError))
-        if contents.messages and not names and not _has_positions(contents) and len(files) == 1:
-            return _message_recording(path, contents.messages, options)
-        parts.append(_rows(file, contents, options.num_joints, names))
-    for file, part in zip(files, parts, strict=True):
-        if (part.blocks.keys(), part.label) != (parts[0].blocks.keys(), parts[0].label):
+        parts.append(_rows(file, _read_content(file), options.num_joints, names))
+        if (parts[-1].blocks.keys(), parts[-1].label) != (parts[0].blocks.keys(), parts[0].label):
             raise RecordingError(
-                f"{file}: {part.note}; {files[0]}: {parts[0].note}. All files of a folder must have the same arrays."
+                f"{file}: {parts[-1].note}; {files[0]}: {parts[0].note}. All files of a folder must have the same "
+                "arrays."
             )
-    order = options.joint_order(path)
+    order, label = options.joint_order(path), parts[0].label
     blocks = {quantity: np.concatenate([part.blocks[quantity] for part in parts]) for quantity in parts[0].blocks}
     blocks = {quantity: block if quantity == "t" else block[:, order] for quantity, block in blocks.items()}
-    label = parts[0].label
     notes = [parts[0].note if len(files) == 1 else f"{len(files)} files; {parts[0].note} of each file"]
     if "t" in blocks and len(files) > 1:
         del blocks["t"]
@@ -104,8 +111,6 @@ def read_array_file(path: Path, options: FileOptions) -> Recording:
         omitted, reason = np.flatnonzero(~valid) + 1, "NaN or infinite" + (label == "pose") * ", or all zeros"
         notes.append(f"{len(omitted)} of {len(valid)} {label}s skipped ({reason}): {listed(omitted)}")
     rows = np.flatnonzero(valid)
-    if options.rate is not None and len(files) > 1:
-        raise RecordingError(f"{path}: --rate does not apply to a folder; read the motion of one file")
     return options.recording(
         path,
         {quantity: block[rows] for quantity, block in blocks.items()},
@@ -116,6 +121,108 @@ def read_array_file(path: Path, options: FileOptions) -> Recording:
         line_label=label,
         times_from="array",
     )
+
+
+def _collection(folder: Path) -> list[Path]:
+    return sorted(
+        file
+        for file in folder.rglob("*")
+        # macOS creates additional files whose names begin with a dot.
+        if file.suffix.lower() in _SUFFIXES and file.is_file() and not file.name.startswith(".")
+    )
+
+
+def _is_hdf5(content: bytes) -> bool:
+    # MATLAB writes a header of 512 bytes before the HDF5 signature.
+    return any(content[start : start + 8] == _HDF5_MAGIC for start in (0, 512))
+
+
+class _Content(NamedTuple):
+    """Arrays of real numbers by name, and the names of the MATLAB classes of objects that are not read."""
+
+    arrays: dict[str, NDArray]
+    classes: set[str]
+
+    def __str__(self) -> str:
+        shapes = [f"{name} ({_shape(array)})" for name, array in self.arrays.items()]
+        return ", ".join(shapes[:_LISTED]) + (", ..." if len(shapes) > _LISTED else "") or "none"
+
+    @property
+    def unreadable(self) -> str:
+        """Text on the objects that are not read, or ""."""
+        if not self.classes:
+            return ""
+        return (
+            f"; objects of the MATLAB class {', '.join(sorted(self.classes))} are not read; save their numbers as "
+            "arrays, e.g. q = data.Data; t = data.Time; save('log.mat', 'q', 't', '-v7')"
+        )
+
+    def add(self, name: str, value: Any) -> None:
+        """Adds a variable. Members of structures have names with dots: "log.q"."""
+        if isinstance(value, dict):
+            for member, own in value.items():
+                self.add(f"{name}.{member}", own)
+        elif getattr(value, "dtype", np.dtype(bool)).names:
+            # An object of a class. scipy 1.18 has changed the names of its members.
+            label = value["_Class" if "_Class" in value.dtype.names else "s2"].item()
+            self.classes.add(label if isinstance(label, str) else label.decode())
+        elif isinstance(value, (list, _Class)) or getattr(value, "dtype", np.dtype(bool)).kind == "O":
+            self.classes.add(value if isinstance(value, _Class) else "struct" if isinstance(value, list) else "cell")
+        elif np.asarray(value).dtype.kind in "fiu":
+            self.arrays[name] = np.asarray(value)
+
+
+class _Class(str):
+    """Name of the class of an object that is not read."""
+
+
+def _read_content(path: Path) -> _Content:
+    content, found = read_input(path, RecordingError), _Content({}, set())
+    read = _read_hdf5 if _is_hdf5(content) else _read_npz if content[:4] == _ZIP_MAGIC else _read_mat
+    try:
+        with warnings.catch_warnings(action="error", category=UserWarning):
+            for name, value in read(content).items():
+                found.add(name, value)
+    except Exception as error:
+        # For a damaged file the libraries raise errors of many types: ValueError, OSError, zlib.error, KeyError, ...
+        text = " ".join(str(error).split())
+        raise RecordingError(f"{path}: the file is damaged, or not a MATLAB file or NumPy archive ({text})") from error
+    return found
+
+
+def _read_mat(content: bytes) -> dict[str, Any]:
+    """Returns the content of a file up to version 7. Dimensions of 1 are dropped."""
+    run = subprocess.run([sys.executable, "-c", _LOADER], input=content, capture_output=True, check=False)
+    if run.returncode:
+        lines = run.stderr.decode(errors="replace").strip().splitlines()
+        raise ValueError(lines[-1] if lines and run.returncode > 0 else "the reader crashed")
+    loaded: dict[str, Any] = pickle.loads(run.stdout)
+    return loaded
+
+
+def _read_hdf5(content: bytes) -> dict[str, Any]:
+    """Returns the content of a file of version 7.3."""
+    # The import takes 0.2 s, and most commands read no file of version 7.3.
+    import h5py
+
+    def plain(item: Any) -> Any:
+        if isinstance(item, h5py.Group):
+            return {name: plain(member) for name, member in item.items()}
+        kind = item.attrs.get("MATLAB_class", b"double" if item.dtype.kind != "O" else b"struct").decode()
+        if kind == "char" or "MATLAB_empty" in item.attrs:
+            return ""
+        # MATLAB stores arrays by columns, HDF5 by rows.
+        is_number = kind in ("double", "single", "logical") or "int" in kind
+        return np.asarray(item).T if is_number else _Class(kind)
+
+    with h5py.File(io.BytesIO(content), "r") as file:
+        # MATLAB stores references under a name that begins with #.
+        return {name: plain(item) for name, item in file.items() if not name.startswith("#")}
+
+
+def _read_npz(content: bytes) -> dict[str, Any]:
+    with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+        return {name: archive[name] for name in archive.files}
 
 
 class _Rows(NamedTuple):
@@ -132,80 +239,53 @@ class _Rows(NamedTuple):
     label: str = "row"
 
 
-def _collection(folder: Path) -> list[Path]:
-    return sorted(
-        file
-        for file in folder.rglob("*")
-        # macOS creates additional files whose names begin with a dot.
-        if file.suffix.lower() in _SUFFIXES and file.is_file() and not file.name.startswith(".")
-    )
-
-
-def _has_positions(content: ArrayContent) -> bool:
-    """Returns whether an array has a recognised name of positions."""
-    return any(name.rpartition(".")[2].lower() in _NAMES["q"] for name in content.arrays)
-
-
-def _message_recording(path: Path, variables: Mapping[str, list[JointState]], options: FileOptions) -> Recording:
-    """Returns the recording of the only variable with messages."""
-    if len(variables) > 1:
-        raise RecordingError(
-            f"{path}: several variables have JointState messages: {', '.join(variables)}. Save the messages of one arm."
-        )
-    (name, messages), *_ = variables.items()
-    states = collect_joint_states(
-        path, name, messages, skip_invalid=options.skip_invalid, item=lambda number: f"message {number} of {name}"
-    )
-    return joint_recording(path, states, None, options, sha256_of(path), "message")
-
-
-def _rows(path: Path, content: ArrayContent, n: int, names: Mapping[str, str]) -> _Rows:
+def _rows(path: Path, content: _Content, n: int, names: Mapping[str, str]) -> _Rows:
     """Returns the rows of the named and the recognised arrays."""
     arrays = content.arrays
-    shapes = [f"{name} ({_shape(array)})" for name, array in arrays.items()]
-    found = ", ".join(shapes[:_LISTED]) + (", ..." if len(shapes) > _LISTED else "") or "none"
-    if content.unreadable:
-        found += f"; {content.unreadable}"
     for quantity, name in names.items():
         if name not in arrays:
-            raise RecordingError(f"{path}: has no array {name} for {quantity}. Arrays of real numbers: {found}.")
-    chosen = _chosen(path, arrays, n, names, found)
+            raise RecordingError(
+                f"{path}: has no array {name} for {quantity}. Arrays of real numbers: {content}{content.unreadable}."
+            )
+    chosen = _chosen(path, content, n, names)
     if "poses" in chosen:
         if len(chosen) > 1:
             raise RecordingError(f"{path}: poses contains positions and efforts; do not name other arrays")
         return _poses(path, chosen["poses"], arrays[chosen["poses"]], n)
-    blocks = {
-        quantity: _joint_rows(path, name, arrays[name], n) for quantity, name in chosen.items() if quantity != "t"
-    }
-    if "t" in chosen:
-        t = arrays[chosen["t"]]
-        if t.size != max(t.shape, default=0):
-            raise RecordingError(f"{path}: {chosen['t']} is {_shape(t)}; allowed for t: a vector")
-        blocks["t"] = np.asarray(t, float).reshape(-1)
-    for quantity, block in blocks.items():
-        if len(block) != len(blocks["q"]):
+    blocks = {}
+    for quantity, name in chosen.items():
+        array = np.asarray(arrays[name], float)
+        is_time = quantity == "t"
+        if array.size != max(array.shape, default=0) if is_time else not _is_joint_array(array, n):
+            allowed = f"for {n} joints: m x {n}, {n} x m, or {n} x poses x samples"
             raise RecordingError(
-                f"{path}: {chosen[quantity]} has {len(block)} rows, but {chosen['q']} has {len(blocks['q'])}; all "
+                f"{path}: {name} is {_shape(array)}; allowed {'for t: a vector' if is_time else allowed}"
+            )
+        is_table = array.ndim == 2 and array.shape[1] == n
+        blocks[quantity] = array.reshape(-1) if is_time else array if is_table else array.reshape(n, -1).T.copy()
+        if len(blocks[quantity]) != len(blocks["q"]):
+            raise RecordingError(
+                f"{path}: {name} has {len(blocks[quantity])} rows, but {chosen['q']} has {len(blocks['q'])}; all "
                 "arrays must have the same number of rows"
             )
     note = ", ".join(f"{quantity} from array {name}" for quantity, name in chosen.items())
-    return _Rows(blocks, f"{note}; {content.unreadable}" if content.unreadable else note)
+    return _Rows(blocks, f"{note}{content.unreadable}")
 
 
-def _chosen(path: Path, arrays: Mapping[str, NDArray], n: int, names: Mapping[str, str], found: str) -> dict[str, str]:
-    """Returns the name of the array of each quantity: the named one, or the only one with a recognised name."""
-    chosen = dict(names)
+def _chosen(path: Path, content: _Content, n: int, names: Mapping[str, str]) -> dict[str, str]:
+    """Returns the name of the array of each quantity, q first: the named one, or the only recognised one."""
+    chosen: dict[str, str] = {}
     if "poses" in names:
-        return chosen
+        return dict(names)
     for quantity, known in _NAMES.items():
-        if quantity in names:
-            continue
         fitting = [
             name
-            for name, array in arrays.items()
+            for name, array in content.arrays.items()
             if name.rpartition(".")[2].lower() in known
             and (array.size > 1 if quantity == "t" else _is_joint_array(array, n))
         ]
+        if quantity in names:
+            fitting = [names[quantity]]
         if len(fitting) > 1:
             raise RecordingError(
                 f"{path}: several arrays may be {quantity}: {', '.join(fitting)}. Choose one with --arrays "
@@ -215,18 +295,18 @@ def _chosen(path: Path, arrays: Mapping[str, NDArray], n: int, names: Mapping[st
             chosen[quantity] = fitting[0]
     if "q" in chosen:
         return chosen
-    poses = [] if names or n != _POSE_JOINTS else [name for name, array in arrays.items() if _is_pose_array(array)]
+    poses = [name for name, array in content.arrays.items() if _is_pose_array(array) and n == _POSE_JOINTS]
+    if names or not poses:
+        raise RecordingError(
+            f"{path}: no array of {n} joints has a recognised name. Name the arrays with --arrays q=NAME tau=NAME "
+            f"(arrays= in Python). Arrays of real numbers: {content}{content.unreadable}."
+        )
     if len(poses) > 1:
         raise RecordingError(
             f"{path}: several arrays have the shape 8 x 2 x N of static poses: {', '.join(poses)}. Choose one with "
             "--arrays poses=NAME (arrays= in Python)."
         )
-    if poses:
-        return {"poses": poses[0]}
-    raise RecordingError(
-        f"{path}: no array of {n} joints has a recognised name. Name the arrays with --arrays q=NAME tau=NAME (arrays= "
-        f"in Python). Arrays of real numbers: {found}."
-    )
+    return {"poses": poses[0]}
 
 
 def _shape(array: NDArray) -> str:
@@ -234,21 +314,14 @@ def _shape(array: NDArray) -> str:
 
 
 def _is_joint_array(array: NDArray, n: int) -> bool:
-    return (array.ndim == 2 and n in array.shape) or (array.ndim == 3 and array.shape[0] == n)
+    # One row, or one joint, is a vector without the dimensions of 1.
+    is_vector = array.ndim == 1 and array.size > 0 and n in (1, array.size)
+    return is_vector or (array.ndim == 2 and n in array.shape) or (array.ndim == 3 and array.shape[0] == n)
 
 
 def _is_pose_array(array: NDArray) -> bool:
-    # MATLAB drops trailing dimensions of 1, so one pose is 8 x 2.
-    return array.ndim in (2, 3) and array.shape[:2] == (_POSE_ROWS, 2)
-
-
-def _joint_rows(path: Path, name: str, array: NDArray, n: int) -> NDArray[np.float64]:
-    if not _is_joint_array(array, n):
-        raise RecordingError(
-            f"{path}: {name} is {_shape(array)}; allowed for {n} joints: m x {n}, {n} x m, or {n} x poses x samples"
-        )
-    values = np.asarray(array, float)
-    return values if values.ndim == 2 and values.shape[1] == n else values.reshape(n, -1).T.copy()
+    # One pose is 8 x 2 without its dimension of 1.
+    return array.ndim in (2, 3) and array.shape[:2] == _POSE_SHAPE
 
 
 def _poses(path: Path, name: str, array: NDArray, n: int) -> _Rows:
@@ -256,18 +329,13 @@ def _poses(path: Path, name: str, array: NDArray, n: int) -> _Rows:
         raise RecordingError(f"{path}: an array of poses contains {_POSE_JOINTS} joints, but the arm has {n}")
     if not _is_pose_array(array):
         raise RecordingError(f"{path}: {name} is {_shape(array)}; allowed: 8 x 2 x N (joint; position, effort; pose)")
-    if array.size == 0:
-        raise RecordingError(f"{path}: array {name} has no poses")
-    joints = np.asarray(array, float).reshape(_POSE_ROWS, 2, -1)[:_POSE_JOINTS]
+    joints = np.asarray(array, float).reshape(*_POSE_SHAPE, -1)[:_POSE_JOINTS]
     blocks = {"q": joints[:, 0].T.copy(), "tau": joints[:, 1].T.copy()}
     return _Rows(blocks, f"static poses from array {name}; its eighth row (gripper) is ignored", "pose")
 
 
 def _valid_rows(path: Path, blocks: Mapping[str, NDArray], label: str, skip_invalid: bool) -> NDArray[np.bool_]:
-    """Returns a mask (m,) of the rows that contain only finite numbers.
-
-    Poses of only zeros are not valid either, because arrays of 8 x 2 x N are allocated before the measurement.
-    """
+    """Returns a mask (m,) of the rows that contain only finite numbers, and of the poses that were recorded."""
     if len(blocks["q"]) == 0:
         raise RecordingError(f"{path}: the arrays have no rows")
     table = np.column_stack([block.reshape(len(blocks["q"]), -1) for block in blocks.values()])

@@ -86,7 +86,7 @@ def read_ros_bag(path: Path, options: FileOptions) -> Recording:
             jaw_states = bag.read(jaw, options.skip_invalid, lambda done: progress((counts[name] + done) / total))
     progress(1.0)
     files = sorted(file for file in path.iterdir() if file.is_file()) if path.is_dir() else [path]
-    recording = joint_recording(path, states, jaw_states, options, sha256_of(*files), "message")
+    recording = joint_recording(path, states, options, sha256_of(*files), jaw_states)
     if len(bag.parts) > 1:
         merged = f"no metadata.yaml: {', '.join(part.name for part in bag.parts)} were read as parts of one bag"
         recording = replace(recording, notes=(merged, *recording.notes))
@@ -142,13 +142,7 @@ class _Bag:
             except Exception as error:
                 raise self._error(error) from error
 
-        return collect_joint_states(
-            self._path,
-            topic,
-            messages(),
-            skip_invalid=skip_invalid,
-            item=lambda number: f"message {number} of {topic}",
-        )
+        return collect_joint_states(self._path, topic, messages(), skip_invalid=skip_invalid)
 
     def close(self) -> None:
         """Closes the bag."""

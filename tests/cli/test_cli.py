@@ -14,6 +14,7 @@ from command_output import messages, refusal
 from forked import forked_program
 from recordings import csv_block
 
+from dvrk_drake.analysis.excitation.pose_file import save_poses
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.static_model import static_model
@@ -21,7 +22,6 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.sdf_model import MODELS_FOLDER
 from dvrk_drake.processes import connection, simulated_arm
-from dvrk_drake.recordings.pose_file import save_poses
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.recordings.writing import write_recording

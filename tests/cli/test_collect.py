@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from sticky_arm import PERIOD, StickyArm, near_poses
 
+from dvrk_drake.analysis.excitation.pose_file import load_poses, save_poses
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes.arm_controller import ArmController
-from dvrk_drake.recordings.pose_file import load_poses, save_poses
 from dvrk_drake.recordings.reading import read_recording
 
 

@@ -11,6 +11,7 @@ import pytest
 import yaml
 from recordings import HEADER, ROW, random_recording
 
+from dvrk_drake.analysis.excitation.pose_file import CollectionFile, load_poses
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ArmError, DvrkDrakeError, ModelError, RecordingError
@@ -24,7 +25,6 @@ from dvrk_drake.models.sdf_model import MODELS_FOLDER, compose_sdf
 from dvrk_drake.models.typed_yaml import parse_yaml
 from dvrk_drake.processes.simulated_arm import load_driver
 from dvrk_drake.recordings import csv_rows
-from dvrk_drake.recordings.pose_file import CollectionFile, load_poses
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.writing import write_recording
 

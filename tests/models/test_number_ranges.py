@@ -14,6 +14,7 @@ import yaml
 from command_output import refusal
 from schema_faults import schema_fault
 
+from dvrk_drake.analysis.excitation.pose_file import PoseFile
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, ModelFile
 from dvrk_drake.errors import ArmError, ControllerError, ModelError, ScenarioError, StationError
@@ -37,7 +38,6 @@ from dvrk_drake.models.ranges import RANGE, Range, number_fault, within
 from dvrk_drake.models.sdf_model import _RANGES, MODELS_FOLDER
 from dvrk_drake.processes.collector import CollectionSettings
 from dvrk_drake.processes.simulated_arm import load_driver
-from dvrk_drake.recordings.pose_file import PoseFile
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 from dvrk_drake.systems.hand import Grip
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver

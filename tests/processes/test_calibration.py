@@ -13,14 +13,14 @@ from command_output import refusal
 from models_in_directives import OTHER_ARM
 
 import dvrk_drake as dvrk
+from dvrk_drake.analysis.excitation.periodic_motion import FourierBasis, PeriodicMotion
+from dvrk_drake.analysis.excitation.pose_file import CollectionFile, load_poses, save_poses
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import ValidationSummary
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.processes import calibration
 from dvrk_drake.processes.calibration import CalibrationSettings, calibration_steps
-from dvrk_drake.recordings.motion_parts import MotionPartFile, Rehearsal
-from dvrk_drake.recordings.periodic_motion import FourierBasis, PeriodicMotion
-from dvrk_drake.recordings.pose_file import CollectionFile, load_poses, save_poses
+from dvrk_drake.processes.motion_parts import MotionPartFile, Rehearsal
 
 ARM = dvrk.load_arm("psm")
 

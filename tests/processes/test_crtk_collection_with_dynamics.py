@@ -10,11 +10,11 @@ from sticky_arm import Disk
 
 pytest.importorskip("cyclonedds", reason="needs cyclonedds")
 
+from dvrk_drake.analysis.excitation.pose_file import CollectionFile
 from dvrk_drake.dynamics.identified_model import ControlModel, IdentifiedModel
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes.arm_controller import GoalController, MotionStyle
 from dvrk_drake.processes.collector import CollectionSettings, Collector, approaches, estimated_duration
-from dvrk_drake.recordings.pose_file import CollectionFile
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.ros.crtk_arm_state import CrtkCommand

@@ -4,15 +4,14 @@ import numpy as np
 import pytest
 from sticky_arm import PERIOD, Disk, StickyArm, run_collector
 
+from dvrk_drake.analysis.excitation.periodic_motion import FourierBasis, PeriodicMotion
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import CollectionError, RecordingError
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.processes import motion_player
+from dvrk_drake.processes import motion_parts, motion_player
 from dvrk_drake.processes.arm_controller import ArmController
+from dvrk_drake.processes.motion_parts import MotionPartFile, begin_of_rest, next_part, recorded_parts, useful
 from dvrk_drake.processes.motion_player import MotionPlayer
-from dvrk_drake.recordings import motion_parts
-from dvrk_drake.recordings.motion_parts import MotionPartFile, begin_of_rest, next_part, recorded_parts, useful
-from dvrk_drake.recordings.periodic_motion import FourierBasis, PeriodicMotion
 from dvrk_drake.recordings.reading import read_recording
 
 ARM = load_arm("mtml")

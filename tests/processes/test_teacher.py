@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from sticky_arm import Disk, near_poses
 
+from dvrk_drake.analysis.excitation.pose_file import load_poses
 from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes.teacher import EnterKey, Teacher
-from dvrk_drake.recordings.pose_file import load_poses
 
 
 class Hand:

@@ -68,7 +68,7 @@ def test_joins_the_jaw_of_a_psm(psm, tmp_path):
     path = write_collection(tmp_path, JOINTS, arm, jaw)
     np.testing.assert_array_equal(read_recording(path, psm).q, q)
     path = write_collection(tmp_path, JOINTS, arm)
-    assert_refused(r"measured_js has no jaw\. Collect jaw/measured_js as well", read_recording, path, psm)
+    assert_refused(r"PSM also needs jaw\. Record jaw/measured_js as well", read_recording, path, psm)
 
 
 def test_omits_invalid_and_repeated_rows(mtm, tmp_path):
@@ -108,7 +108,7 @@ def test_faults_are_refused(mtm, psm, tmp_path):
     signal = joint_state("measured_js", mtm.joint_names, times(4), q, qd, tau)
     path = write_collection(tmp_path, JOINTS, signal)
     assert_refused(r"needs the arm .*--arm", read_recording, path)
-    assert_refused("has the joints outer_yaw.*but PSM has yaw.*Check --arm", read_recording, path, psm)
+    assert_refused("has the joints outer_yaw.*PSM also needs yaw.*Check --arm", read_recording, path, psm)
     still = joint_state("measured_js", mtm.joint_names, np.ones(4), q, qd, tau)
     assert_refused(
         "the times do not increase in 3 of 4 rows of measured_js",

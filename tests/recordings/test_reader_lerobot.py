@@ -58,7 +58,7 @@ def test_faults_are_refused(tmp_path):
     index, (q, tau, t) = episode(0)
     q[2, 3] = np.nan
     path = write_data_set(tmp_path, [*ARM.joint_names[:6], "hand"], [[(index, (q, tau, t))]])
-    assert_refused(r"row 3: the position of .* is nan; only finite", read_recording, path, ARM)
+    assert_refused(r"row 3 of observation.state: the position of .* is nan; only finite", read_recording, path, ARM)
     assert_refused("has the joints .*hand; MTML also needs .*--joints", read_recording, path, ARM, skip_invalid=True)
     joints = {ARM.joint_names[6]: "hand"}
     assert len(read_recording(path, ARM, joints=joints, skip_invalid=True)) == 4

@@ -333,9 +333,7 @@ def test_refuses_a_clock_that_was_set(mtm, tmp_path, jump):
     times[26 : 27 if jump > 0 else 40] += round(1e9 * jump) + 3_000_000
     path = write_bag(tmp_path, "mcap", {"/MTML/measured_js": joint_states(times, mtm.joint_names, q, qd, tau)})
     late = 28 if jump > 0 else 27
-    with pytest.raises(
-        RecordingError, match=f"message {late} of /MTML/measured_js is .* s before that of message {late - 1}"
-    ):
+    with pytest.raises(RecordingError, match=f"message {late} is .* s before that of message {late - 1}"):
         read_recording(path, mtm)
 
 
@@ -353,7 +351,7 @@ def test_refuses_efforts_of_some_messages_or_joints(psm, mtm, tmp_path):
     rows = joint_states(stamps(5), mtm.joint_names, q, qd, tau)
     rows[0] = (*rows[0][:4], np.empty(0))
     path = write_bag(tmp_path, "ros1", {"/MTML/measured_js": rows})
-    with pytest.raises(RecordingError, match=r"message 1 of /MTML/measured_js has no effort, but message 2 of .* has"):
+    with pytest.raises(RecordingError, match=r"message 1 of /MTML/measured_js has no effort, but message 2 has"):
         read_recording(path, mtm)
     arm = joint_states(stamps(5), psm.joint_names[:6], q[:, :6], qd[:, :6], tau[:, :6])
     jaw = joint_states(stamps(5), ["jaw"], q[:, 6:], qd[:, 6:])

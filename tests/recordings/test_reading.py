@@ -7,9 +7,9 @@ import pytest
 import scipy.io
 from public_files import assert_refused, team_array, wpi_rows, write_mat, write_text, write_wpi
 
+from dvrk_drake.analysis.excitation.pose_file import CollectionFile
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.recordings.pose_file import CollectionFile
 from dvrk_drake.recordings.reading import detect_format, read_recording
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.recordings.writing import write_recording

@@ -4,12 +4,12 @@ from concurrent.futures import Executor, Future
 
 import numpy as np
 
+from dvrk_drake.analysis.excitation.pose_file import CollectionFile
 from dvrk_drake.dynamics.identified_model import ControlModel, IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.collector import CollectionSettings, Collector
-from dvrk_drake.recordings.pose_file import CollectionFile
 from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.guard.settings import GuardSettings
 from dvrk_drake.systems.lcm.dvrk_status import fill_in_guard

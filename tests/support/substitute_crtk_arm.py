@@ -5,11 +5,11 @@ from types import SimpleNamespace
 import numpy as np
 from sticky_arm import Disk
 
+from dvrk_drake.analysis.excitation.pose_file import CollectionFile
 from dvrk_drake.dynamics.identified_model import ControlModel, IdentifiedModel
 from dvrk_drake.errors import CollectionError
 from dvrk_drake.processes.arm_controller import GoalController
 from dvrk_drake.processes.collector import CollectionSettings, Collector
-from dvrk_drake.recordings.pose_file import CollectionFile
 from dvrk_drake.systems.ros.crtk_move_link import CrtkMoveLink
 
 #: Interval of the measurements [s].

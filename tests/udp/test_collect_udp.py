@@ -11,10 +11,10 @@ from arm_observer import Observer, accepts_efforts, is_holding
 from arm_processes import LONG_TIMEOUT_DRIVER, dvrk_drake
 from waiting import wait_until
 
+from dvrk_drake.analysis.excitation.pose_file import load_poses, save_poses
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.recordings.pose_file import load_poses, save_poses
 from dvrk_drake.recordings.reading import read_recording
 
 pytestmark = [pytest.mark.network, pytest.mark.realtime, pytest.mark.slow]

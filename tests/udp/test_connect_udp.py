@@ -13,7 +13,7 @@ from ros_publisher import DOMAIN_FILE
 from waiting import TIMEOUT
 
 import dvrk_drake as dvrk
-from dvrk_drake.recordings.periodic_motion import FourierBasis, PeriodicMotion
+from dvrk_drake.analysis.excitation.periodic_motion import FourierBasis, PeriodicMotion
 
 ros = pytest.importorskip("dvrk_drake.systems.ros.domain", reason="needs cyclonedds")
 

@@ -17,10 +17,10 @@ from own_network import end, start
 from ros_publisher import DOMAIN_FILE
 from waiting import TIMEOUT, wait_until, within_time_limit
 
+from dvrk_drake.analysis.excitation.pose_file import save_poses
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.recordings.pose_file import save_poses
 from dvrk_drake.recordings.reading import read_recording
 
 ros = pytest.importorskip("dvrk_drake.systems.ros.domain", reason="needs cyclonedds")

@@ -12,6 +12,7 @@ from pydrake.solvers import MathematicalProgram, SnoptSolver, SolverOptions
 
 from dvrk_drake.analysis.excitation.information import STEP, MotionInformation
 from dvrk_drake.analysis.excitation.motion_limits import ROUNDING, MotionLimits, first_collision, motion_violations
+from dvrk_drake.analysis.excitation.periodic_motion import FourierBasis, PeriodicMotion
 from dvrk_drake.analysis.excitation.random_motion import (
     USED,
     effort_without_friction,
@@ -25,7 +26,6 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.progress import Progress, step_progress
-from dvrk_drake.recordings.periodic_motion import FourierBasis, PeriodicMotion
 
 #: Number of times per harmonic at which the information is computed and the efforts are limited. The information
 #: contains products of two states, whose frequencies require more than four times.

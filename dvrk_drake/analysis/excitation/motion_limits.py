@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dvrk_drake.analysis.excitation.collisions import CollisionDetector, first_collision
+from dvrk_drake.analysis.excitation.periodic_motion import PeriodicMotion
 from dvrk_drake.analysis.excitation.predicted_effort import PredictedEffort
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ExcitationError
@@ -18,7 +19,6 @@ from dvrk_drake.models.arm_schema import POSITIONS
 from dvrk_drake.models.environment import Environment
 from dvrk_drake.models.ranges import number_fault, within
 from dvrk_drake.models.soft_walls import SoftWalls
-from dvrk_drake.recordings.periodic_motion import PeriodicMotion
 
 #: Rate at which a motion is checked [Hz], and accepted rounding error of a limit, relative to the width of its range.
 #: Between the times, the highest possible harmonic (20 Hz) grows by at most 0.2 % of its amplitude.

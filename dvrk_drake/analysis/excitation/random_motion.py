@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.excitation.motion_limits import MotionLimits
+from dvrk_drake.analysis.excitation.periodic_motion import FourierBasis, PeriodicMotion
 from dvrk_drake.analysis.excitation.predicted_effort import PredictedEffort
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.recordings.periodic_motion import FourierBasis, PeriodicMotion
 
 #: Number of times per harmonic at which the limits are imposed. Between the times, the highest harmonic grows by at
 #: most 2.5 % of its amplitude.

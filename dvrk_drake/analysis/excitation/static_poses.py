@@ -15,6 +15,7 @@ from dvrk_drake.analysis.estimation.pose_effects import MIN_TORQUE, StaticProble
 from dvrk_drake.analysis.excitation.collisions import CollisionDetector
 from dvrk_drake.analysis.excitation.information import ExpectedError
 from dvrk_drake.analysis.excitation.motion_limits import PATH_STEP, ROUNDING, MotionLimits
+from dvrk_drake.analysis.excitation.pose_file import save_poses
 from dvrk_drake.analysis.excitation.predicted_effort import PredictedEffort
 from dvrk_drake.analysis.excitation.random_motion import middle_pose
 from dvrk_drake.analysis.observations.static_poses import MIN_POSES
@@ -26,7 +27,6 @@ from dvrk_drake.models.environment import Environment
 from dvrk_drake.models.files import refuse_existing
 from dvrk_drake.models.plant import inverse_dynamics
 from dvrk_drake.progress import Progress, step_progress
-from dvrk_drake.recordings.pose_file import save_poses
 
 #: Number of random poses from which the poses are selected, largest number of random poses that are drawn for this
 #: pool, and largest number of selected poses. If 5 % of the drawn poses meet all limits, the pool is complete. With

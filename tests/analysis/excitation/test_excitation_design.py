@@ -9,12 +9,12 @@ import dvrk_drake as dvrk
 from dvrk_drake.analysis.excitation.design import contracted
 from dvrk_drake.analysis.excitation.information import MotionInformation, _presliding
 from dvrk_drake.analysis.excitation.motion_limits import MotionLimits, motion_violations
+from dvrk_drake.analysis.excitation.periodic_motion import PeriodicMotion
 from dvrk_drake.analysis.excitation.random_motion import random_motion, state_of
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.environment import Environment
-from dvrk_drake.recordings.periodic_motion import PeriodicMotion
 from dvrk_drake.workers import local_executor
 
 PERIOD = 5.0

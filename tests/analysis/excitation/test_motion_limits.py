@@ -11,12 +11,12 @@ from dvrk_drake.analysis.excitation.motion_limits import (
     motion_violations,
     tip_positions,
 )
+from dvrk_drake.analysis.excitation.periodic_motion import FourierBasis, PeriodicMotion
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.environment import Environment
 from dvrk_drake.models.plant import inverse_dynamics
-from dvrk_drake.recordings.periodic_motion import FourierBasis, PeriodicMotion
 
 pytestmark = pytest.mark.drake_api
 

@@ -10,6 +10,7 @@ import dvrk_drake as dvrk
 from dvrk_drake.analysis.excitation import static_poses
 from dvrk_drake.analysis.excitation.collisions import CollisionDetector, first_collision
 from dvrk_drake.analysis.excitation.motion_limits import MotionLimits, tip_positions
+from dvrk_drake.analysis.excitation.pose_file import load_poses
 from dvrk_drake.analysis.excitation.static_poses import (
     MARGIN,
     MIN_APPROACH,
@@ -24,7 +25,6 @@ from dvrk_drake.models.approach import approach_offset, offset_pose
 from dvrk_drake.models.environment import Environment
 from dvrk_drake.processes.arm_controller import MotionStyle
 from dvrk_drake.processes.collector import CollectionSettings, approaches
-from dvrk_drake.recordings.pose_file import load_poses
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from sticky_arm import random_poses
 
+from dvrk_drake.analysis.excitation.pose_file import CollectionFile, save_poses
 from dvrk_drake.cli import main
 from dvrk_drake.errors import CollectionError, RecordingError
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.recordings.pose_file import CollectionFile, save_poses
 from dvrk_drake.recordings.reading import read_recording
 
 ARMS = ("mtml", "psm")

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from sticky_arm import random_poses
 
+from dvrk_drake.analysis.excitation.pose_file import load_poses, save_poses
 from dvrk_drake.cli import main
 from dvrk_drake.errors import CollectionError
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.recordings.pose_file import load_poses, save_poses
 
 ARMS = ("mtml", "psm")
 

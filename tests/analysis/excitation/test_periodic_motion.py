@@ -5,9 +5,9 @@ import pytest
 import yaml
 
 from dvrk_drake.analysis.excitation.motion_limits import spectral_derivative
+from dvrk_drake.analysis.excitation.periodic_motion import FourierBasis, PeriodicMotion
 from dvrk_drake.errors import DvrkDrakeError, ExcitationError
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.recordings.periodic_motion import FourierBasis, PeriodicMotion
 
 ARM = load_arm("psm")
 PERIOD, HARMONICS = 4.0, 5
