@@ -94,6 +94,13 @@ class HardwareArmStation(LeafSystem):
 
     Attributes:
         link: Link to the arm.
+
+    Example:
+        >>> import dvrk_drake as dvrk
+        >>> driver = dvrk.DvrkDriver(lcm_url="memq://")  # messages within this process; default: LCM's network
+        >>> station = dvrk.HardwareArmStation(dvrk.load_arm("mtml"), driver=driver)
+        >>> station.GetOutputPort("mtml.state_estimated").size()
+        14
     """
 
     def __init__(

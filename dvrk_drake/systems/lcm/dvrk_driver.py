@@ -40,6 +40,11 @@ class DvrkDriver:
         model: File of the identified model with which the guard checks measurements. The path is relative to the
             driver's YAML file. If it is empty, the model of the arm's SDF is used.
         guard: Settings of the command guard.
+
+    Example:
+        >>> import dvrk_drake as dvrk
+        >>> driver = dvrk.DvrkDriver(control_modes=["effort"], lcm_url="memq://")  # messages within this process
+        >>> station = dvrk.HardwareArmStation(dvrk.load_arm("mtml"), driver=driver)
     """
 
     lcm_url: str = ""

@@ -32,6 +32,11 @@ class CrtkDriver:
             the model of the arm's SDF is used.
         control_modes: Modes that the guard of a real arm accepts in addition to hold; see `DvrkDriver`.
         guard: Settings of the command guard of a real arm.
+
+    Example:
+        >>> import dvrk_drake as dvrk
+        >>> dvrk.CrtkDriver(namespace="/PSM2", control_modes=["effort"]).rate
+        1000.0
     """
 
     domain: int | None = field(default=None, metadata=within(0, 232))
