@@ -89,6 +89,21 @@ Arm = Annotated[
         help="ecm, ecm_si, mtml, mtmr, psm, psm_si, or the path of a YAML, URDF, SDF or MJCF file.",
     ),
 ]
+Instrument = Annotated[
+    str,
+    Parameter(
+        metavar="NAME",
+        show_default=False,
+        help="Instrument of the dVRK, e.g. PROGRASP_FORCEPS_420093, or the path of its file. Default: that of the arm.",
+    ),
+]
+
+
+def with_instrument(arm: str, instrument: str) -> str:
+    """Returns the argument of `load_arm` for an arm with the instrument given with --instrument."""
+    return f"{arm}+{instrument}" if instrument else arm
+
+
 Model = Annotated[str, Parameter(metavar="MODEL.yaml", help="Model file, written by identify.")]
 Gravity = Annotated[
     tuple[float, float, float] | None,
@@ -172,8 +187,12 @@ class LcmArm:
     """Options of all commands for an arm over LCM."""
 
     arm: Arm
+    instrument: Instrument = ""
     lcm_url: LcmUrl = ""
     key: Key = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "arm", with_instrument(self.arm, self.instrument))
 
 
 @Parameter(name="*")

@@ -15,12 +15,14 @@ from dvrk_drake.cli.app import (
     Arm,
     EnvironmentFile,
     Gravity,
+    Instrument,
     Overwrite,
     Seconds,
     Seed,
     Table,
     app,
     whole_number,
+    with_instrument,
 )
 from dvrk_drake.cli.support import Steps, check_output, load_environment, mounted, print_written
 from dvrk_drake.errors import ExcitationError
@@ -38,6 +40,7 @@ def excite(
     *,
     arm: Arm,
     output: Annotated[str, Parameter(metavar="FILE.yaml")],
+    instrument: Instrument = "",
     static: Annotated[int | None, Parameter(metavar="N", converter=whole_number)] = None,
     model: Annotated[str | None, Parameter(metavar="MODEL.yaml")] = None,
     csv: Annotated[str | None, Parameter(metavar="FILE.csv")] = None,
@@ -94,6 +97,7 @@ def excite(
         "starts": starts,
         "traverse-time": traverse_time,
     }
+    arm = with_instrument(arm, instrument)
     if static is not None:
         if given := [f"--{name}" for name, value in of_motion.items() if value is not None]:
             raise ExcitationError(f"{' and '.join(given)} cannot be used with --static")

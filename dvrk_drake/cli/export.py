@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Group, Parameter
 
-from dvrk_drake.cli.app import Arm, Model, Overwrite, Verbose, export, one_of
+from dvrk_drake.cli.app import Arm, Instrument, Model, Overwrite, Verbose, export, one_of, with_instrument
 from dvrk_drake.cli.report import ResultsAndJson
 from dvrk_drake.cli.support import Steps, check_output, load_model, print_warning, print_written
 from dvrk_drake.errors import DvrkDrakeError, ModelError
@@ -34,6 +34,7 @@ def export_model(
     *,
     model: SourceModel = None,
     arm: SourceArm = None,
+    instrument: Instrument = "",
     sdf: Annotated[str | None, Parameter(metavar="FILE.sdf")] = None,
     urdf: Annotated[str | None, Parameter(metavar="FILE.urdf")] = None,
     dvrk_gc: Annotated[str | None, Parameter(metavar="FILE.json")] = None,
@@ -90,6 +91,9 @@ def export_model(
         raise DvrkDrakeError("--friction and --coulomb exclude each other; give one of them")
     if configuration is not None and dvrk_kinematic_gc is None:
         raise DvrkDrakeError("--configuration requires --dvrk-kinematic-gc; only the file of a PSM uses mounting_pitch")
+    if instrument and arm is None:
+        raise DvrkDrakeError("--instrument requires --arm; a model contains its instrument")
+    arm = with_instrument(arm, instrument) if arm else None
     loaded = load_model(model, arm)
     for format, path in outputs.items():
         check_output(path, model or "", configuration or "", overwrite=overwrite)

@@ -13,6 +13,7 @@ from dvrk_drake.cli.app import (
     Arm,
     FileOptions,
     Gravity,
+    Instrument,
     Locked,
     Model,
     Overwrite,
@@ -80,6 +81,7 @@ def identify_model(
     *others: str,
     arm: Arm,
     output: NewModel,
+    instrument: Instrument = "",
     file: FileOptions = _FILE,
     method: Literal["robust", "paper"] = "robust",
     gravity: OwnGravity = None,
@@ -100,7 +102,7 @@ def identify_model(
 
     paths = (recording, *others)
     results.check(*paths, output=output)
-    recorded_arm = mounted(dvrk.load_arm(arm), None if gravity == "estimate" else gravity, locked)
+    recorded_arm = mounted(dvrk.load_arm(arm, instrument), None if gravity == "estimate" else gravity, locked)
     with Steps(*_STEPS, "identifying") as steps:
         read = []
         for path in paths:

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from dvrk_drake.cli.app import MODEL, Arm, Gravity, LcmUrl, Overwrite, Port, app
+from dvrk_drake.cli.app import MODEL, Arm, Gravity, Instrument, LcmUrl, Overwrite, Port, app
 from dvrk_drake.cli.support import Steps, check_output, mounted, print_written, until_stopped
 from dvrk_drake.errors import DvrkDrakeError
 
@@ -17,6 +17,7 @@ from dvrk_drake.errors import DvrkDrakeError
 def equations(
     *,
     arm: Arm,
+    instrument: Instrument = "",
     format: Literal["latex", "python", "c"] | None = None,
     output: Annotated[str | None, Parameter(metavar="FILE")] = None,
     overwrite: Overwrite = False,
@@ -39,7 +40,7 @@ def equations(
         if format is None:
             raise DvrkDrakeError("--output requires --format latex, python or c")
         check_output(output, overwrite=overwrite)
-    shown = mounted(load_arm(arm), gravity)
+    shown = mounted(load_arm(arm, instrument), gravity)
     with Steps("deriving the gravity torque"):
         derived = derive_gravity(shown)
     if format is None:
@@ -92,6 +93,7 @@ def arm_file(
 def view(
     *,
     arm: Arm,
+    instrument: Instrument = "",
     live: Annotated[bool, Parameter(show_default=False)] = False,
     lcm_url: LcmUrl = "",
     port: Port = None,
@@ -113,7 +115,7 @@ def view(
 
     if lcm_url and not live:
         raise DvrkDrakeError("--lcm-url requires --live")
-    shown = load_arm(arm)
+    shown = load_arm(arm, instrument)
     url = open_lcm(lcm_url).get_lcm_url() if live else ""
     meshcat = start_meshcat(shown, port=port)
     arm_view = ArmView(shown, meshcat)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from dvrk_drake.cli.app import Arm, Gravity, Key, LcmUrl, Model, Realtime, RosDomain, RosTopic, bridge
+from dvrk_drake.cli.app import Arm, Gravity, Instrument, Key, LcmUrl, Model, Realtime, RosDomain, RosTopic, bridge
 from dvrk_drake.cli.support import driver_configuration, interrupt_ends_process, mounted, request_realtime
 from dvrk_drake.errors import ControllerError
 
@@ -17,6 +17,7 @@ from dvrk_drake.errors import ControllerError
 def bridge_arm(
     *,
     arm: Arm,
+    instrument: Instrument = "",
     topic: RosTopic = None,
     domain: RosDomain = None,
     model: Annotated[
@@ -52,7 +53,7 @@ def bridge_arm(
 
     domain_number(domain)  # rejects an invalid number before any other step
     with interrupt_ends_process():
-        connected = mounted(load_arm(arm), gravity)
+        connected = mounted(load_arm(arm, instrument), gravity)
         configuration = driver_configuration(driver, key, lcm_url)
         configuration.model = model or configuration.model
         stopped = stop_on_signals()

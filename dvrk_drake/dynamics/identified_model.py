@@ -2,6 +2,7 @@
 
 import math
 import os
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -247,8 +248,8 @@ class IdentifiedModel(_Identified):
 
         Args:
             path: Path of the model file.
-            arm: Expected arm. A model of an arm with another name or other joints is rejected. The returned model has
-                the arm that the model file names, not this object.
+            arm: Expected arm. A model of an arm with another name or other joints is rejected, and one with another
+                instrument causes a warning. The returned model has the arm that the model file names, not this object.
 
         Raises:
             ModelError: The file does not exist, is not a model file, does not match the arm that it names, or is not a
@@ -263,6 +264,12 @@ class IdentifiedModel(_Identified):
                 raise ModelError(f"the model is for {own_arm.name}, not for {arm.name}")
             if arm is not None and own_arm.joint_names != arm.joint_names:
                 raise ModelError(_other_joints(own_arm, arm))
+            if arm is not None and own_arm.instrument != arm.instrument:
+                warnings.warn(
+                    f"{path}: the model has the instrument {own_arm.instrument or 'none'}, but the arm has "
+                    f"{arm.instrument or 'none'}; friction and couplings of the instrument differ",
+                    stacklevel=2,
+                )
             model = cls(arm=own_arm, **{part.name: getattr(file, part.name) for part in fields(_Identified)})
             model.check()
         except ArmError as error:

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import PurePath
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -172,6 +173,18 @@ class Arm:
     def num_joints(self) -> int:
         """Number of independent joints."""
         return len(self.joint_names)
+
+    @property
+    def instrument(self) -> str:
+        """Name of the instrument, "" if the arm carries none."""
+        return PurePath(self.sdf[1]).stem if len(self.sdf) > 1 else ""
+
+    @property
+    def full_name(self) -> str:
+        """Name, with the instrument if it is not that of the arm file, e.g. "PSM+CADIERE_FORCEPS_400049"."""
+        _, plus, exchanged = self.source.rpartition("+")
+        is_exchanged = plus and PurePath(exchanged).stem == self.instrument
+        return f"{self.name}+{self.instrument}" if is_exchanged else self.name
 
     def per_joint(self, revolute: float, prismatic: float) -> NDArray[np.float64]:
         """Returns an array (n,) with the value `revolute` for revolute joints and `prismatic` for prismatic joints."""

@@ -25,6 +25,7 @@ from dvrk_drake.models.arm_schema import (
     Mechanism,
     ViewSettings,
 )
+from dvrk_drake.models.dvrk_tool import dvrk_tools, tool_instrument
 from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.models.immutable import cached
 from dvrk_drake.models.linear_map import LinearMap
@@ -45,7 +46,7 @@ def known_arms() -> list[str]:
     return sorted(path.stem for path in _ARMS.glob("*.yaml"))
 
 
-def load_arm(name: str | Path) -> Arm:
+def load_arm(name: str | Path, instrument: str | Path = "") -> Arm:
     """Loads an arm. Repeated calls, also from other threads, return the same immutable object until the file changes.
 
     Changes of the other files of an arm file (mechanism, instrument, model) take effect only in a new process.
@@ -57,10 +58,13 @@ def load_arm(name: str | Path) -> Arm:
 
     Args:
         name: Name of an arm of this package, e.g. "mtml" (not case-sensitive). For any other arm, the path or package
-            URL of its arm file (YAML) or of a model file.
+            URL of its arm file (YAML) or of a model file. The `source` of an arm with another instrument is accepted
+            too, e.g. "psm+PROGRASP_FORCEPS_400093".
+        instrument: Instrument that replaces the one of the arm: the name of an instrument of the dVRK, or the path of
+            an instrument file, of the dVRK (JSON) or of this package (YAML). "": that of the arm.
 
     Raises:
-        ArmError: The arm does not exist, or its files are invalid or inconsistent.
+        ArmError: The arm does not exist, carries no instrument, or its files are invalid or inconsistent.
 
     Example:
         >>> import dvrk_drake as dvrk
@@ -68,10 +72,17 @@ def load_arm(name: str | Path) -> Arm:
         >>> on_its_side = arm.with_gravity([0, -9.81, 0])  # [m/s^2] in the base frame
         >>> int(arm.prismatic.argmax()), arm.joint_names[2]
         (2, 'insertion')
+        >>> dvrk.load_arm("psm_si", "PROGRASP_FORCEPS_420093").source
+        'psm_si+PROGRASP_FORCEPS_420093'
     """
     name = os.fspath(name)
     if "\0" in name:
         raise ArmError(f"{name!r} is not a valid file name")
+    own, plus, other = name.partition("+")
+    if plus and own.lower() in known_arms():
+        name, instrument = own, instrument or other
+    if instrument:
+        return _load_arm(f"{load_arm(name).source}+{_instrument_name(instrument)}")
     if not name.lower().endswith((".yaml", ".yml", *MODEL_SUFFIXES)):
         if name.lower() not in known_arms() and os.path.isfile(name):
             raise ArmError(f"{name} is not the file of an arm; {_accepted()}")
@@ -84,6 +95,25 @@ def load_arm(name: str | Path) -> Arm:
         status = path.stat()
         return _load_arm(str(path), (status.st_mtime_ns, status.st_size))
     return _load_arm(str(path))
+
+
+def _instrument_name(instrument: str | Path) -> str:
+    """Returns the name of an instrument as in the table of the dVRK, or the absolute path of its file."""
+    name = os.fspath(instrument)
+    if name.lower().endswith((".json", ".yaml", ".yml")):
+        return os.path.realpath(local_path(name))
+    known = [*dvrk_tools(), *_known_parts("instrument")]
+    if not (found := [each for each in known if each.lower() == name.lower()]):
+        near = suggest_name(name, known)
+        raise ArmError(
+            f'unknown instrument "{name}"; {near}allowed: an instrument of the dVRK, e.g. {known[0]}, or the '
+            "path of its file (JSON or YAML)"
+        )
+    return found[0]
+
+
+def _known_parts(kind: str) -> list[str]:
+    return sorted(path.stem for path in (MODELS_FOLDER / f"{kind}s").glob("*.yaml"))
 
 
 def derived_arm_file(model: str | Path, folder: str | Path) -> str:
@@ -169,12 +199,13 @@ def is_package_arm(arm: Arm | str) -> bool:
 @cached
 def _load_arm(name: str, state: tuple[int, int] = (0, 0)) -> Arm:
     """Loads an arm by name or absolute path. `state` (time of change, size) is the version of the YAML file."""
-    path = Path(name)
+    file, _, other_instrument = name.partition("+") if not os.path.exists(name) else (name, "", "")
+    path = Path(file)
     if not path.is_absolute():
-        if name not in known_arms():
-            near = suggest_name(name, known_arms())
-            raise ArmError(f'unknown arm "{name}"; {near}{_accepted()}')
-        path = _ARMS / f"{name}.yaml"
+        if file not in known_arms():
+            near = suggest_name(file, known_arms())
+            raise ArmError(f'unknown arm "{file}"; {near}{_accepted()}')
+        path = _ARMS / f"{file}.yaml"
     if str(path).lower().endswith(MODEL_SUFFIXES):
         description = ArmDescription(sdf=str(path))
     else:
@@ -188,8 +219,10 @@ def _load_arm(name: str, state: tuple[int, int] = (0, 0)) -> Arm:
         stated = {key: value for key, value in stated.items() if value != getattr(unstated, key)}
         mechanism = dataclasses.replace(mechanism, **stated)
     instrument = Instrument()
-    if description.instrument:
-        instrument = _load_part(Instrument, path, "instrument", description.instrument)
+    if other_instrument and not description.instrument:
+        raise ArmError(f"{file}: the arm carries no instrument that can be exchanged")
+    if other_instrument or description.instrument:
+        instrument = _load_instrument(path, other_instrument or description.instrument)
     try:
         arm = _build_arm(name, path, description, mechanism, instrument)
         if path.parent.parent != MODELS_FOLDER:
@@ -199,6 +232,15 @@ def _load_arm(name: str, state: tuple[int, int] = (0, 0)) -> Arm:
     except ArmError as error:
         raise error if str(error).startswith(str(path)) else ArmError(f"{path}: {error}") from error
     return arm
+
+
+def _load_instrument(arm_path: Path, name: str) -> Instrument:
+    if name in dvrk_tools():
+        return tool_instrument(MODELS_FOLDER / f"instruments/{name}.json", f"{PACKAGE_URL}instruments/{name}.json")
+    if name.lower().endswith(".json"):
+        path = Path(os.path.realpath(arm_path.parent / name))
+        return tool_instrument(path, str(path))
+    return _load_part(Instrument, arm_path, "instrument", name)
 
 
 def _load_part(schema: type[Part], arm_path: Path, kind: str, name: str) -> Part:
@@ -213,7 +255,7 @@ def _load_part(schema: type[Part], arm_path: Path, kind: str, name: str) -> Part
         _resolve_sdf(part, path)
         return part
     folder = MODELS_FOLDER / f"{kind}s"
-    known = sorted(path.stem for path in folder.glob("*.yaml"))
+    known = _known_parts(kind)
     if name not in known:
         raise ArmError(
             f'{arm_path}: unknown {kind} "{name}"; known {kind}s: {", ".join(known)}, or the path of a YAML file'

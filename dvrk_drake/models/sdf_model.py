@@ -12,6 +12,7 @@ from pathlib import Path
 
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm_schema import EFFORTS
+from dvrk_drake.models.dvrk_tool import tool_sdf
 from dvrk_drake.models.immutable import cached
 from dvrk_drake.models.model_file import MODEL_SUFFIXES, convert_model
 from dvrk_drake.models.ranges import Range
@@ -109,10 +110,11 @@ def compose_sdf(urls: Sequence[str]) -> ElementTree.Element:
     Raises:
         ArmError: A file is not a model of an arm, or repeats a link with inertia.
     """
-    root, *others = (_read(local_path(url), may_convert=url == urls[0]) for url in urls)
+    root = _read(local_path(urls[0]), may_convert=True)
     (model,) = root.findall("model")
     links = {link.get("name", ""): link for link in model.findall("link")}
-    for other in others:
+    for url in urls[1:]:
+        other = _read(local_path(url), may_convert=False, arm=root)
         for part in other.iterfind("model/*"):
             if part.tag == "link" and part.get("name", "") in links:
                 _add_shapes(links[part.get("name", "")], part)
@@ -184,8 +186,15 @@ def read_sdf_facts(root: ElementTree.Element) -> SdfFacts:
     return SdfFacts(tuple(names), mimics, efforts, positions, frozenset(prismatic), links, frames, last_link)
 
 
-def _read(path: Path, may_convert: bool) -> ElementTree.Element:
-    """Returns the model of a file. A file that is not an SDF of one model with a link `base_link` may be converted."""
+def _read(path: Path, may_convert: bool, arm: ElementTree.Element | None = None) -> ElementTree.Element:
+    """Returns the model of a file. A file that is not an SDF of one model with a link `base_link` may be converted.
+
+    The file of an instrument of the dVRK needs the arm that carries it.
+    """
+    if path.suffix.lower() == ".json":
+        root = tool_sdf(path, arm)
+        _check_numbers(path, root)
+        return root
     if may_convert and path.suffix.lower() != ".sdf" and path.name.lower().endswith(MODEL_SUFFIXES):
         return _convert(path)
     root = read_xml(path)

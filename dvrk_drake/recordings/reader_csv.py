@@ -118,7 +118,7 @@ def read_csv(path: Path, options: FileOptions) -> Recording:
         path,
         {name: block[:, 0] if name == "t" else block for name, block in found.blocks.items()},
         found.rows,
-        notes=(*notes, *found.notes),
+        notes=(*notes, *found.notes, *_instrument_notes(stated, arm)),
         default_rate=WPI_RATE if is_wpi else None,
         default_coordinates="wpi" if is_wpi else "",
         lines=found.lines,
@@ -139,10 +139,18 @@ def _stated(file: CsvFile, after: int, header: list[str], arm: Arm | None) -> di
     if len(cells) != len(header):
         return {}
     stated = {name: cell.strip() for name, cell in zip(header, cells, strict=True)}
-    name = stated.get("arm", "")
+    name = stated.get("arm", "").partition("+")[0]
     if name and arm is not None and name.lower() != arm.name.lower():
         raise RecordingError(f"{file.path}, line {line}: the row is of {name[:30]}, but the selected arm is {arm.name}")
     return stated
+
+
+def _instrument_notes(stated: dict[str, str], arm: Arm | None) -> list[str]:
+    """Returns a note if the file states another instrument than that of the arm."""
+    _, _, instrument = stated.get("arm", "").partition("+")
+    if arm is None or not instrument or instrument == arm.instrument:
+        return []
+    return [f"recorded with the instrument {instrument}, but the selected arm has {arm.instrument or 'none'}"]
 
 
 def _message_fields(where: str, header: list[str]) -> dict[str, list[int]]:

@@ -113,7 +113,7 @@ class _CsvFile(GrowingFile):
 
     def write(self, data: bytes, utime: int, status: lcmt_dvrk_status | None) -> None:
         if status is not None:
-            self.append(csv_line([*status_cells(self._stream.time(status), status), "joint", self._arm.name]))
+            self.append(csv_line([*status_cells(self._stream.time(status), status), "joint", self._arm.full_name]))
 
     def close(self) -> None:
         super().close()

@@ -55,7 +55,7 @@ def write_recording(
         path,
         {prefix: block for prefix, block in blocks.items() if block is not None},
         arm,
-        {"coordinates": recording.coordinates, "arm": arm.name if arm else recording.arm_name},
+        {"coordinates": recording.coordinates, "arm": arm.full_name if arm else recording.arm_name},
     )
 
 

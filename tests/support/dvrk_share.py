@@ -24,17 +24,17 @@ def dvrk_share(shared_data: Path) -> Path:
 
 
 def dh_rows(path: Path) -> list[dict[str, Any]]:
-    """Returns the rows of the DH table in a file, with exact quarter turns in place of 1.5708."""
+    """Returns the rows of the DH table in a file, with exact eighths of a turn in place of e.g. 1.5708."""
     table = read_json_input(path, ArmError)["DH"]
     assert table["convention"] == "modified"
-    return [exact_quarter_turns(row) for row in table.get("joints") or table["links"]]
+    return [exact_eighths(row) for row in table.get("joints") or table["links"]]
 
 
-def exact_quarter_turns(row: dict[str, Any]) -> dict[str, Any]:
-    """Returns a row of a DH table with exact quarter turns."""
+def exact_eighths(row: dict[str, Any]) -> dict[str, Any]:
+    """Returns a row of a DH table with exact eighths of a turn."""
     row = dict(row)
     for key in {"alpha", "theta", "offset"} & row.keys():
-        exact = round(row[key] / (np.pi / 2)) * np.pi / 2
+        exact = round(row[key] / (np.pi / 4)) * np.pi / 4
         row[key] = exact if abs(row[key] - exact) < ROUNDING else row[key]
     return row
 
