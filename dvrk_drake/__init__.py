@@ -15,10 +15,12 @@ if TYPE_CHECKING:
     from dvrk_drake.analysis.excitation.motion_limits import MotionLimits
     from dvrk_drake.analysis.excitation.periodic_motion import PeriodicMotion
     from dvrk_drake.analysis.excitation.static_poses import design_poses
+    from dvrk_drake.analysis.external_force import estimate_force
     from dvrk_drake.analysis.identification import identify
     from dvrk_drake.analysis.payload import payload
     from dvrk_drake.analysis.recalibration import recalibrate
     from dvrk_drake.analysis.validation import predict, validate
+    from dvrk_drake.dynamics.contact import Contact
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.errors import DvrkDrakeError
     from dvrk_drake.experiments.scenario import Scenario, load_scenario
@@ -42,6 +44,7 @@ if TYPE_CHECKING:
     from dvrk_drake.systems.arm_station import ArmStation
     from dvrk_drake.systems.arm_view.page import start_meshcat
     from dvrk_drake.systems.closed_loop import add_closed_loop
+    from dvrk_drake.systems.external_force_estimator import ExternalForceEstimator
     from dvrk_drake.systems.gravity_pid_controller import GravityPidController
     from dvrk_drake.systems.hardware_arm_station import HardwareArmStation
     from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
@@ -56,11 +59,13 @@ _MODULES = {
     "ArmConnection": "processes.connection",
     "ArmStation": "systems.arm_station",
     "CollectionSettings": "processes.collector",
+    "Contact": "dynamics.contact",
     "Dialog": "processes.connection",
     "CrtkDriver": "systems.ros.crtk_driver",
     "DvrkDrakeError": "errors",
     "DvrkDriver": "systems.lcm.dvrk_driver",
     "Environment": "models.environment",
+    "ExternalForceEstimator": "systems.external_force_estimator",
     "GravityPidController": "systems.gravity_pid_controller",
     "HardwareArmStation": "systems.hardware_arm_station",
     "IdentifiedModel": "dynamics.identified_model",
@@ -79,6 +84,7 @@ _MODULES = {
     "connect": "processes.connection",
     "design_excitation": "analysis.excitation.design",
     "design_poses": "analysis.excitation.static_poses",
+    "estimate_force": "analysis.external_force",
     "export_model": "export.model_export",
     "identify": "analysis.identification",
     "load_arm": "models.arm_files",
@@ -103,11 +109,13 @@ __all__ = [
     "ArmConnection",
     "ArmStation",
     "CollectionSettings",
+    "Contact",
     "CrtkDriver",
     "Dialog",
     "DvrkDrakeError",
     "DvrkDriver",
     "Environment",
+    "ExternalForceEstimator",
     "GravityPidController",
     "HardwareArmStation",
     "IdentifiedModel",
@@ -126,6 +134,7 @@ __all__ = [
     "connect",
     "design_excitation",
     "design_poses",
+    "estimate_force",
     "export_model",
     "identify",
     "load_arm",

@@ -61,7 +61,10 @@ def test_unknown_name_is_in_the_error():
 
 
 #: Names whose examples take seconds, and whose functions other tests call.
-LONG = ("payload", "design_poses", "design_excitation", "PeriodicMotion")
+LONG = (
+    *("payload", "design_poses", "design_excitation", "PeriodicMotion"),
+    *("estimate_force", "ExternalForceEstimator"),
+)
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow if n in LONG else ()) for n in dvrk.__all__])

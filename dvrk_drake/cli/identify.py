@@ -321,3 +321,59 @@ def payload(
     page = payload_page(result, model_path=model)
     warnings = [warning for warning in result.warnings if warning.kind == "other link"]
     results.show(page, *paths, model, content=result.as_dicts(), warnings=warnings)
+
+
+_VECTOR = Parameter(metavar="X Y Z")
+
+
+@app.command(group=IDENTIFY)
+def force(
+    recording: Recording,
+    /,
+    *,
+    model: Model,
+    frame: Annotated[str, Parameter(metavar="NAME", show_default=False)] = "",
+    point: Annotated[tuple[float, float, float], _VECTOR] = (0.0, 0.0, 0.0),
+    axes: Literal["base", "frame"] = "base",
+    direction: Annotated[tuple[float, float, float] | None, _VECTOR] = None,
+    cannula: Annotated[bool, Parameter(show_default=False)] = False,
+    same_day: Annotated[bool, Parameter(show_default=False)] = False,
+    output: Annotated[str | None, Parameter(metavar="FILE.csv")] = None,
+    file: FileOptions = _FILE,
+    results: Results = _PAGE,
+) -> None:
+    """Estimate the force on a point of the arm over a recording.
+
+    The force is estimated from the motor efforts that the model does not explain. Nothing else may touch the arm.
+
+    Args:
+        frame: Frame of the SDF in which the point is fixed. Default: the tip of an instrument, or the handle.
+        point: Position of the point in the frame [m].
+        axes: Axes of the force: those of the base or of the frame.
+        direction: Direction of the force in these axes, if it is known.
+        cannula: A cannula can exert an unknown axial force on the shaft.
+        same_day: The model was identified on the day of the recording. Default: the intervals contain the assumed
+            change of the efforts between days.
+        output: CSV file to write, with columns force1..3 [N], or force1 with --direction, and the external joint
+            efforts tau1..taun [N m; N if prismatic]. Columns with _lower, _upper, lower and upper are the limits of the
+            95 % intervals. A force is nan in rows in which the arm cannot measure it.
+    """
+    from dvrk_drake.reports.external_force import force_page
+
+    results.check(recording, model, output=output)
+    with Steps(*_STEPS, "estimating the force") as steps:
+        loaded, read = _model_and_recording(model, recording, file, steps)
+        result = dvrk.estimate_force(
+            read,
+            loaded,
+            frame=frame,
+            point=point,
+            axes=axes,
+            direction=direction,
+            cannula=cannula,
+            same_day=same_day,
+            progress=steps,
+        )
+    if output is not None:
+        result.save(output, overwrite=True)
+    results.show(force_page(result), recording, model, note=result.note, warnings=result.warnings, saved=output)

@@ -8,8 +8,9 @@ coefficient * shape(x, v, state) to the effort along its coordinate, see `effect
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -130,6 +131,79 @@ def _run_effect(
         state, out[i] = effect_step(code, state, x[i] - previous, x[i], v[i], scale)
         previous = x[i]
     return out
+
+
+@dataclass(frozen=True, eq=False)
+class EffectArrays:
+    """Effects of an arm as arrays, for the step-by-step evaluation with `advance_effects`.
+
+    Attributes:
+        constants: Rows (k, n) that map joint motions to the coordinates of the effects, codes (k,) of the kinds, scales
+            (k,), exponents (k,) of the position, and coefficients (k,).
+        is_loaded: Mask (k,) of the effects that depend on the load.
+        across: Matrix (n, k) with |tau @ across| = load of each effect, for transmitted actuator efforts tau (n,).
+    """
+
+    constants: tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64], NDArray[np.int64], NDArray]
+    is_loaded: NDArray[np.bool_]
+    across: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, arm: Arm, effects: Sequence[ActuatorEffect], coefficients: NDArray[np.float64]) -> EffectArrays:
+        """Returns the arrays of effects (k,) with their coefficients (k,)."""
+        kinds = [EFFECT_KINDS[effect.kind] for effect in effects]
+        h = np.array([arm.effect_coordinates[effect.coordinate] for effect in effects]).reshape(-1, arm.num_joints)
+        constants = (
+            np.ascontiguousarray(h @ arm.transmission.matrix),
+            np.array([kind.code for kind in kinds], np.int64),
+            np.array([effect.scale for effect in effects], float),
+            np.array([kind.position_power for kind in kinds], np.int64),
+            np.array(coefficients, float),
+        )
+        return cls(constants, np.array([kind.loaded for kind in kinds], bool), (h / np.sum(h**2, 1, keepdims=True)).T)
+
+    @property
+    def size(self) -> int:
+        """Number of elements of the memory of `advance_effects`."""
+        return 2 * len(self.is_loaded) + 1
+
+    @cached_property
+    def no_loads(self) -> NDArray[np.float64]:
+        """Loads (k,) if no effect depends on the load."""
+        return np.ones(len(self.is_loaded))
+
+    def loads(self, transmitted: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Returns the loads (k,) for transmitted efforts (n,) of the actuators, and 1 for effects without a load."""
+        return np.where(self.is_loaded, np.abs(transmitted @ self.across), 1.0)
+
+
+@compiled
+def advance_effects(state, constants, loads, memory, effort):  # pragma: no cover - compiled
+    """Computes the effort of effects, and updates their memory.
+
+    Args:
+        state: Positions, then velocities (2 n) of the joints [rad, m; rad/s, m/s].
+        constants: `EffectArrays.constants`.
+        loads: Loads (k,), see `EffectArrays.loads`.
+        memory: States of the effects and last positions of their coordinates, then 1. Zeros at the start.
+        effort: Receives the sum of the efforts of the effects at the joints (n,) [N m, N].
+    """
+    rows, codes, scales, powers, coefficients = constants
+    k, n = rows.shape
+    for i in range(n):
+        effort[i] = 0.0
+    for j in range(k):
+        x, v = 0.0, 0.0
+        for i in range(n):
+            x += rows[j, i] * state[i]
+            v += rows[j, i] * state[n + i]
+        dx = x - memory[k + j] if memory[2 * k] == 1.0 else 0.0
+        memory[j], shape = effect_step(codes[j], memory[j], dx, x, v, scales[j])
+        memory[k + j] = x
+        factor = coefficients[j] * loads[j] * shape * abs(x) ** powers[j]
+        for i in range(n):
+            effort[i] += factor * rows[j, i]
+    memory[2 * k] = 1.0
 
 
 def distinct_coordinates(arm: Arm) -> list[str]:

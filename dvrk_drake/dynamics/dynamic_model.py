@@ -164,11 +164,34 @@ class DynamicModel:
         day. For a model of several recordings, the held-out parts are whole recordings, so the variance between their
         days is included. They are 0 for a model without this error.
         """
-        return self._half_widths("rms_cross_validation")
+        return half_width(1.0, None) * self._statistics("rms_cross_validation")
 
-    def _half_widths(self, which: str) -> NDArray[np.float64]:
-        widths = {a.name: half_width(getattr(a, which), None) for a in self.section.actuators}
-        return np.array([widths.get(name, 0.0) for name in self.arm.joint_names])
+    def _statistics(self, which: str) -> NDArray[np.float64]:
+        """Returns a field (n,) of `ActuatorStatistics` for each actuator, 0 if it is unknown."""
+        values = {a.name: getattr(a, which) for a in self.section.actuators}
+        return np.array([values.get(name, 0.0) for name in self.arm.joint_names])
+
+    def error_covariance(self, *, other_day: bool = False) -> NDArray[np.float64]:
+        """Returns the covariance (n, n) of the errors of the actuator efforts, for motions as in `half_width`.
+
+        Args:
+            other_day: True for another day. The variance then contains the assumed variance between days
+                (`ActuatorStatistics.rms_between_days`), which is independent for each actuator.
+
+        Raises:
+            ModelError: The model does not state the errors, e.g. because it was not identified.
+        """
+        if not np.all(self.half_width > 0):
+            raise ModelError("the model does not state its errors on held-out motions; use a model from identify")
+        return self._error_covariance(other_day)
+
+    def _error_covariance(self, other_day: bool) -> NDArray[np.float64]:
+        correlation = self.section.error_correlation
+        deviation = self._statistics("rms_cross_validation")
+        covariance = np.outer(deviation, deviation) * (np.eye(len(deviation)) if correlation is None else correlation)
+        if other_day:
+            covariance += np.diag(self._statistics("rms_between_days") ** 2)
+        return np.asarray(covariance)
 
     def combined_half_width(self, combinations: NDArray[np.float64], *, other_day: bool = False) -> NDArray[np.float64]:
         """Returns the half widths (k,) of the prediction intervals of linear combinations of the actuator efforts.
@@ -177,17 +200,11 @@ class DynamicModel:
 
         Args:
             combinations: Coefficients (k, n), e.g. the transposed matrix of `Arm.transmission` for the joint efforts.
-            other_day: True for the intervals on another day. Their variance contains the assumed variance between days
-                (`ActuatorStatistics.rms_between_days`), which is independent for each actuator.
+            other_day: True for the intervals on another day, see `error_covariance`.
         """
-        correlation = self.section.error_correlation
-        scaled = combinations * self.half_width
-        products = scaled @ (np.eye(len(self.half_width)) if correlation is None else np.array(correlation))
-        squares = np.sum(products * scaled, axis=1)
-        if other_day:
-            squares += combinations**2 @ self._half_widths("rms_between_days") ** 2
+        squares = np.sum(combinations @ self._error_covariance(other_day) * combinations, axis=1)
         is_known = np.all((combinations == 0) | (self.half_width > 0), axis=1)
-        return np.where(is_known, np.sqrt(np.maximum(squares, 0.0)), 0.0)
+        return np.where(is_known, half_width(1.0, None) * np.sqrt(np.maximum(squares, 0.0)), 0.0)
 
     def rigid_body_effort(self, q: ArrayLike, v: ArrayLike, vd: ArrayLike) -> NDArray[np.float64]:
         """Returns the actuator efforts (m, n) [N m, N] without effects for a joint motion (m, n)."""

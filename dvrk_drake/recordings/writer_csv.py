@@ -17,6 +17,7 @@ UNITS = {
     "t": ("s", "s"),
     **dict.fromkeys(("q", "pose"), ("rad", "m")),
     "qd": ("rad/s", "m/s"),
+    **dict.fromkeys(("force", "force_lower", "force_upper"), ("N", "N")),
     **dict.fromkeys(("tau", "lower", "upper", "lower_other_day", "upper_other_day", "friction"), ("N m", "N")),
 }
 

@@ -15,6 +15,7 @@ from dvrk_drake.reports.provenance import Provenance
 #: `function(result) -> Page`. Modules are imported when they are needed.
 _MAKERS = {
     "CompensationComparison": ("export", "compensation_page"),
+    "ExternalForce": ("external_force", "force_page"),
     "PayloadIdentification": ("payload", "payload_page"),
     "Tuning": ("tuning", "tuning_page"),
     "DynamicIdentification": ("identification", "identification_page"),

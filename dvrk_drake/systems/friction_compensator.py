@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import numba
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from dvrk_drake.dynamics.actuator_effects import effect_step
+from dvrk_drake.dynamics.actuator_effects import EffectArrays, advance_effects
 from dvrk_drake.dynamics.friction_compensation import Friction, check_ratios, safe_ratios
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.models.arm_schema import IMPLAUSIBLE
-from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 
 
 class FrictionCompensator(LeafSystem):
@@ -89,19 +89,12 @@ class FrictionCompensator(LeafSystem):
         error = np.zeros(n) if holding_error is None else holding_error
         self._ratios = safe_ratios(friction, ratio, error, hysteresis_ratio)
         self._limits = friction.arm.effort_limits
-        kinds = [EFFECT_KINDS[effect.kind] for effect in friction.effects]
-        self._constants = (
-            friction.rows,
-            np.array([kind.code for kind in kinds], np.int64),
-            widening * np.array([effect.scale for effect in friction.effects]),
-            self._ratios * friction.coefficients,
-        )
+        wider = [replace(effect, scale=widening * effect.scale) for effect in friction.effects]
+        self._effects = EffectArrays.of(friction.arm, wider, self._ratios * friction.coefficients)
         self._state_port = self.DeclareVectorInputPort("state_estimated", 2 * n)
         self._wanted_port = self.DeclareVectorInputPort("effort_wanted", n)
-        # Deflections of the elements, last positions of their coordinates, friction effort, and 1 if the last positions
-        # are valid, else 0.
-        self._memory = self.DeclareDiscreteState(2 * len(kinds) + n + 1)
-        self._at = slice(2 * len(kinds), 2 * len(kinds) + n)
+        # The memory of the elements and the friction effort.
+        self._memory = self.DeclareDiscreteState(self._effects.size + n)
         ticket = self.discrete_state_ticket(self._memory)
         self.DeclareVectorOutputPort("effort", n, self._calc_effort, {ticket, self._wanted_port.ticket()})
         self.DeclareVectorOutputPort("friction_effort", n, self._calc_friction_effort, {ticket})
@@ -115,11 +108,16 @@ class FrictionCompensator(LeafSystem):
         return self._ratios.copy()
 
     def _restart(self, context: Context, state: DiscreteValues) -> None:
-        state.get_mutable_value(int(self._memory))[-1] = 0.0
+        state.get_mutable_value(int(self._memory))[:] = 0.0
         self._update(context, state)
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
-        _advance(self._state_port.Eval(context), *self._constants, state.get_mutable_value(int(self._memory)))
+        measured, value = self._state_port.Eval(context), state.get_mutable_value(int(self._memory))
+        size = self._effects.size
+        if np.all(np.abs(measured) < IMPLAUSIBLE):  # false for NaN
+            advance_effects(measured, self._effects.constants, self._effects.no_loads, value[:size], value[size:])
+        else:
+            value[:] = 0.0
 
     def _calc_effort(self, context: Context, output: BasicVector) -> None:
         effort = self._wanted_port.Eval(context) + self._friction_effort(context)
@@ -129,36 +127,4 @@ class FrictionCompensator(LeafSystem):
         output.SetFromVector(self._friction_effort(context))
 
     def _friction_effort(self, context: Context) -> NDArray[np.float64]:
-        return np.asarray(context.get_discrete_state(int(self._memory)).get_value()[self._at])
-
-
-@numba.njit(cache=True)
-def _advance(
-    state: NDArray[np.float64],
-    rows: NDArray[np.float64],
-    codes: NDArray[np.int64],
-    scales: NDArray[np.float64],
-    weights: NDArray[np.float64],
-    memory: NDArray[np.float64],
-) -> None:
-    """Updates the states of all elements and their effort in the array `memory`; see FrictionCompensator."""
-    k, n = rows.shape
-    deflection, last, effort = memory[:k], memory[k : 2 * k], memory[2 * k : 2 * k + n]
-    effort[:] = 0.0
-    was_valid = memory[-1] == 1.0
-    memory[-1] = 0.0
-    for i in range(2 * n):
-        if not abs(state[i]) < IMPLAUSIBLE:  # also true for NaN
-            return
-    memory[-1] = 1.0
-    for j in range(k):
-        x, v = 0.0, 0.0
-        for i in range(n):
-            x += rows[j, i] * state[i]
-            v += rows[j, i] * state[n + i]
-        if not was_valid:
-            deflection[j], last[j] = 0.0, x
-        deflection[j], shape = effect_step(codes[j], deflection[j], x - last[j], x, v, scales[j])
-        last[j] = x
-        for i in range(n):
-            effort[i] += weights[j] * shape * rows[j, i]
+        return np.asarray(context.get_discrete_state(int(self._memory)).get_value()[self._effects.size :])

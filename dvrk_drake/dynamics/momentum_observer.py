@@ -1,0 +1,124 @@
+"""Estimates the joint efforts that act on an arm from outside, with an observer of the generalized momentum."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.dynamics.actuator_effects import EffectArrays, advance_effects
+from dvrk_drake.dynamics.dry_friction_bound import DryFrictionBound
+from dvrk_drake.dynamics.dynamic_model import is_loaded
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.errors import ControllerError, ModelError
+
+
+class MomentumObserver:
+    """Observer of the generalized momentum of an arm (De Luca and Mattone, ICRA 2003).
+
+    With the momentum p = M(q) v, the estimate r of the external joint efforts obeys
+
+        dr/dt = w (tau_model(q, v, dv/dt) - tau_measured - r).
+
+    r is therefore the first-order low-pass of the efforts that the model does not explain. w is the bandwidth. The
+    change of the momentum in a period replaces the acceleration, so no acceleration is measured. The model contains the
+    links, rotors, gravity, cables, springs and friction. Elements of friction with a state start without deflection.
+
+    The pose is low-pass filtered with the same bandwidth, because the estimate belongs to this earlier pose.
+
+    Attributes:
+        model: Model of the arm.
+        bandwidth: Bandwidth w [rad/s].
+        size: Number of elements of the state.
+    """
+
+    def __init__(self, model: IdentifiedModel, *, bandwidth: float = 15.0, period: float = 1e-3) -> None:
+        """Reads the model.
+
+        Args:
+            model: Model that was identified from a motion, or a nominal model with dynamics.
+            bandwidth: Bandwidth w [rad/s].
+            period: Time between two updates [s].
+
+        Raises:
+            ModelError: The model was identified from static poses.
+            ControllerError: Bandwidth or period is out of range.
+        """
+        if model.dynamics is None:
+            raise ModelError(
+                "the external effort of a moving arm requires a model that was identified from a motion; this model "
+                "has no inertia and no friction"
+            )
+        if not (0 < period < 1 and 0 < bandwidth * period < 1):
+            raise ControllerError(
+                f"period must be larger than 0 and smaller than 1 s, and bandwidth between 0 and 1 / period; got "
+                f"{period:g} s and {bandwidth:g} rad/s"
+            )
+        self.model, self.bandwidth, self._period = model, float(bandwidth), float(period)
+        dynamics = model.dynamic_model
+        arm = model.arm
+        self._dynamics, self._n = dynamics, arm.num_joints
+        self._effects = EffectArrays.of(arm, dynamics.effects, dynamics.coefficients)
+        self._is_loaded = is_loaded(dynamics.effects)
+        self._bound = DryFrictionBound(dynamics, self.bandwidth)
+        J = arm.transmission.matrix
+        self._model_covariance = J.T @ dynamics.error_covariance() @ J
+        self._other_day = J.T @ dynamics.error_covariance(other_day=True) @ J
+        self._decay = np.exp(-self.bandwidth * self._period)
+        sizes = [self._n, len(self._bound.deviation), self._n, self._n, self._effects.size]
+        ends = np.cumsum(sizes)
+        self._r, self._rest, self._q, self._v, self._memory = map(slice, [0, *ends[:-1]], ends)
+        self.size = int(ends[-1])
+
+    def start(self) -> NDArray[np.float64]:
+        """Returns the state (size,) before the first measurement: no external effort, and friction as at rest."""
+        state = np.zeros(self.size)
+        state[self._rest] = 1.0
+        state[self._v] = np.nan
+        return state
+
+    def update(
+        self, state: NDArray[np.float64], q: NDArray[np.float64], v: NDArray[np.float64], tau: NDArray[np.float64]
+    ) -> None:
+        """Updates the state in place with a measurement.
+
+        Args:
+            state: State (size,).
+            q, v: Positions [rad, m] and velocities (n,) of the joints.
+            tau: Efforts (n,) of the motors at the joints [N m, N].
+        """
+        if np.isnan(state[self._v][0]):
+            state[self._q], state[self._v] = q, v
+        vd = (v - state[self._v]) / self._period
+        regressor = self._dynamics.regressor
+        rigid = regressor.torque(q[None], v[None], vd[None], self._dynamics.parameters)[0]
+        loads = self._loads(q, v, vd) if self._is_loaded else self._effects.no_loads
+        friction = np.empty(self._n)
+        advance_effects(np.concatenate([q, v]), self._effects.constants, loads, state[self._memory], friction)
+        share = 1.0 - self._decay
+        state[self._r] += share * (rigid + friction - tau - state[self._r])
+        state[self._rest] += share * (self._bound.rest(v) - state[self._rest])
+        state[self._q] += share * (q - state[self._q])
+        state[self._v] = v
+
+    def effort(self, state: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Returns the external joint efforts (n,) [N m, N]."""
+        return state[self._r].copy()
+
+    def pose(self, state: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Returns the joint positions (n,) to which the effort belongs [rad, m]."""
+        return state[self._q].copy()
+
+    def covariance(self, state: NDArray[np.float64], *, other_day: bool = True) -> NDArray[np.float64]:
+        """Returns the covariance (n, n) of the external joint efforts.
+
+        It contains the errors of the model on held-out motions, and the dry friction of joints at rest.
+
+        Args:
+            state: State (size,).
+            other_day: True to include the assumed change of the efforts between days.
+        """
+        errors = self._other_day if other_day else self._model_covariance
+        return errors + self._bound.covariance(state[self._rest])
+
+    def _loads(self, q: NDArray[np.float64], v: NDArray[np.float64], vd: NDArray[np.float64]) -> NDArray[np.float64]:
+        return self._effects.loads(self._dynamics.transmitted_effort(q[None], v[None], vd[None])[0])
