@@ -61,7 +61,7 @@ def teleop(
     Args:
         output: Play a recorded hand motion, write an animation to this HTML file, and print the PSM's tracking error.
     """
-    from dvrk_drake.experiments.demo.teleoperation import play_teleoperation, run_live_teleoperation
+    from dvrk_drake.experiments.demo.teleoperation import PHASES, play_teleoperation, run_live_teleoperation
     from dvrk_drake.experiments.demo.teleoperation_scene import start_scene
     from dvrk_drake.models.files import atomic_write
     from dvrk_drake.reports.demo import teleoperation_page
@@ -82,7 +82,7 @@ def teleop(
     with Steps("playing") as steps:
         result = play_teleoperation(meshcat, progress=step_progress(steps, "playing"))
     with atomic_write(output) as stream:
-        stream.write(page_html(meshcat, "MTML teleoperates PSM"))
+        stream.write(page_html(meshcat, "MTML teleoperates PSM", phases=PHASES, effort_scale=True))
     print_page(make_console(), teleoperation_page(result, output), verbose=verbose)
     print_written(output)
 

@@ -100,8 +100,8 @@ def view(
 ) -> None:
     """Show an arm in a web browser.
 
-    Sliders set the joint positions. The linkage stays closed. Buttons show frames, joint names and gravity efforts,
-    and move the camera.
+    The controls are under Open Controls. Sliders set the joint positions, and the linkage stays closed. Buttons move
+    the camera. Sliders from 0 to 1 show frames and gravity efforts, and select degrees.
 
     Args:
         live: Show the measured pose and efforts from the LCM messages of the arm, and the commanded pose as a ghost.
@@ -109,7 +109,7 @@ def view(
     from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.processes.live_view import show_status
     from dvrk_drake.systems.arm_view.arm_view import ArmView
-    from dvrk_drake.systems.arm_view.page import start_meshcat, tracked_url
+    from dvrk_drake.systems.arm_view.page import start_meshcat
     from dvrk_drake.systems.lcm.arm_link import LcmArmLink
     from dvrk_drake.systems.lcm.lcm_network import open_lcm
 
@@ -123,9 +123,9 @@ def view(
     ending = "press Stop, Escape or Ctrl-C to end"
     if live:
         link = LcmArmLink(shown, url, replays=True)
-        print(f"{shown.name} live at {tracked_url(meshcat)}; {ending}", flush=True)
+        print(f"{shown.name} live at {meshcat.web_url()}; {ending}", flush=True)
         until_stopped(meshcat, lambda: show_status(arm_view, link))
         return
     arm_view.add_sliders()
-    print(f"{shown.name} at {tracked_url(meshcat)}; the controls are under Open Controls; {ending}", flush=True)
+    print(f"{shown.name} at {meshcat.web_url()}; the controls are under Open Controls; {ending}", flush=True)
     until_stopped(meshcat, arm_view.follow_controls)

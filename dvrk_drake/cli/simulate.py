@@ -51,9 +51,7 @@ def simulate_scenario(
     results.check(source, loaded.controller.model, output=output)
     page = dvrk.start_meshcat(loaded.mounted_arm) if meshcat else None
     if page is not None:
-        from dvrk_drake.systems.arm_view.page import tracked_url
-
-        print(f"{loaded.mounted_arm.name} at {tracked_url(page)}", flush=True)
+        print(f"{loaded.mounted_arm.name} at {page.web_url()}", flush=True)
     with Steps("simulating") as steps:
         simulation = dvrk.simulate(loaded, meshcat=page, progress=steps)
     argument = (scenario or f"--arm {arm}") if results.plots is None else None

@@ -23,7 +23,7 @@ _TIMEOUT = 0.2
 def show_status(view: ArmView, link: ArmLink) -> None:
     """Displays the newest status, if there is a new status and its measured pose is finite.
 
-    The view shows the measured pose and efforts. A ghost shows the commanded pose, and a caption the guard state.
+    The view shows the measured pose and efforts. A ghost shows the commanded pose, the control panel the guard state.
     """
     view.follow_controls()
     try:
@@ -34,7 +34,7 @@ def show_status(view: ArmView, link: ArmLink) -> None:
         commanded = status.position_commanded
         desired = commanded if np.all(np.isfinite(commanded)) else None
         view.show(status.position, effort=status.effort_measured, desired=desired)
-        view.overlay.set_phase(describe_state(status.guard_state))
+        view.overlay.set_state(describe_state(status.guard_state))
 
 
 # The function `prctl` is looked up before the fork, because few operations are safe after a fork.

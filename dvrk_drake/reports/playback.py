@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.geometry import MeshcatVisualizer, MeshcatVisualizerParams
-from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
-from pydrake.systems.framework import DiagramBuilder
 
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.plant import add_arm, set_arm_positions
+from dvrk_drake.systems.arm_view.drawn_arm import DrawnArm
 from dvrk_drake.systems.arm_view.overlay import ArmOverlay
 from dvrk_drake.systems.arm_view.page import page_html, start_meshcat
 
@@ -40,22 +37,13 @@ def playback(arm: Arm, t: NDArray[np.float64], q: NDArray[np.float64], tau: NDAr
     poses, efforts = (np.column_stack([np.interp(times, t, x) for x in values.T]) for values in (q, tau))
     period = float(times[1] - times[0])
     meshcat = start_meshcat(arm)
-    builder = DiagramBuilder()
-    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=1e-3)
-    add_arm(plant, arm)
-    plant.Finalize()
-    links = MeshcatVisualizerParams(publish_period=period, prefix=f"{arm.name.lower()}/links")
-    visualizer = MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat, links)
-    diagram = builder.Build()
-    context = diagram.CreateDefaultContext()
-    overlay = ArmOverlay(arm, meshcat)
-    visualizer.StartRecording()
+    links, overlay = DrawnArm(arm, meshcat, f"{arm.name.lower()}/links"), ArmOverlay(arm, meshcat)
+    meshcat.StartRecording(frames_per_second=1 / period)
     for k, (pose, effort) in enumerate(zip(poses, efforts, strict=True)):
         # The time is in the middle of the frame, so that rounding does not change the number of the frame.
-        context.SetTime((k + 0.5) * period)
-        set_arm_positions(plant, plant.GetMyMutableContextFromRoot(context), arm, pose)
-        diagram.ForcedPublish(context)
-        overlay.draw(pose, effort=effort, time=context.get_time())
-    visualizer.StopRecording()
-    visualizer.PublishRecording()
-    return page_html(meshcat, arm.name)
+        time = (k + 0.5) * period
+        links.draw(pose, time)
+        overlay.draw(pose, effort=effort, time=time)
+    meshcat.StopRecording()
+    meshcat.PublishRecording()
+    return page_html(meshcat, arm.name, effort_scale=True)

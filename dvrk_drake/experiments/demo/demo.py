@@ -56,7 +56,7 @@ PHASES = (
     (HELD_UNTIL, "released: gravity compensation only"),
     (RELEASED_UNTIL, "driven home: the controller regulates a motion"),
 )
-COLOURS = "grey: identified model     green: model of the SDF"
+COLOURS = {"#a0a4a8": "controlled with the identified model", "#2caa67": "controlled with the model of the SDF"}
 #: Colour of the ghost: that of the model of the SDF in the plots.
 GHOST_COLOUR = Rgba(0.17, 0.67, 0.4, 0.5)
 
@@ -229,7 +229,8 @@ def _run_demo(output: Path, true_sdf: Path, arm_name: str, seed: int, progress: 
     meshcat = start_meshcat(arm)
     released = _animated_release(station(meshcat), model, plan, meshcat, with_nominal, part(0.3, 1.0))
     with atomic_write(output / "arm.html") as stream:
-        stream.write(page_html(meshcat, f"{arm.name} (simulated) - dvrk-drake demo"))
+        title = f"{arm.name} (simulated) - dvrk-drake demo"
+        stream.write(page_html(meshcat, title, phases=PHASES, colors=COLOURS))
     window = slice(_index(HELD_UNTIL), _index(RELEASED_UNTIL) + 1)
     return DemoResult(
         arm=arm,
@@ -322,13 +323,11 @@ def _animated_release(
     """
     overlay = ArmOverlay(station.arm, meshcat)
     overlay.add_ghost(GHOST, GHOST_COLOUR)
-    overlay.captions.set_text("colours", COLOURS, v=-0.82)
 
     def draw(i: int, q: NDArray[np.float64]) -> None:
-        if i % SAMPLES_PER_FRAME:
+        if i % SAMPLES_PER_FRAME and i != _index(HOME_UNTIL):
             return
         time = i * SAMPLE_PERIOD
-        overlay.set_phase([text for start, text in PHASES if start <= time][-1], time)
         ghosts = {GHOST: ghost[i]} if _index(HELD_UNTIL) <= i < len(ghost) else None
         overlay.draw(q, ghosts=ghosts, time=time)
 

@@ -29,6 +29,13 @@ START_MASTER = np.array([0.0, 0.25, -0.1, 0.0, 1.2, 0.0, 0.0])
 START_FOLLOWER = np.array([0.0, 0.0, 0.13, 0.0, 0.0, 0.0, 0.5])
 #: Time intervals of the simulated motion in which the clutch is closed [s].
 ENGAGED = ((0.5, 9.7), (11.2, 16.0))
+#: Phases of this motion, for the page with its animation: start times [s] and texts.
+PHASES = (
+    (0.0, "clutch open: PSM holds its pose"),
+    (0.5, "clutch closed: PSM follows"),
+    (9.7, "clutch open: PSM holds its pose"),
+    (11.2, "clutch closed: PSM follows"),
+)
 DURATION = 16.0
 PERIOD = 0.02
 BLUE, GREY = Rgba(0.1, 0.35, 0.75), Rgba(0.35, 0.35, 0.35)
@@ -110,7 +117,6 @@ def play_teleoperation(
             samples.X_FT.append(arms.CalcX_FT(context))
             if scene is not None:
                 scene.draw(arms, context, time=t)
-                scene.set_phase("clutch closed" if samples.following[-1] else "clutch open", t)
             progress(t / duration)
     if meshcat is not None:
         _draw_paths(meshcat, samples)
@@ -120,8 +126,8 @@ def play_teleoperation(
 def run_live_teleoperation(meshcat: Meshcat, duration: float = np.inf) -> None:
     """Simulates teleoperation in real time with controls for hand, clutch, jaw and scale in Meshcat.
 
-    The simulation ends after `duration` [s], or earlier if the user clicks the button Stop. A caption shows the state
-    of the clutch, the scale and the tracking error.
+    The simulation ends after `duration` [s], or earlier if the user clicks the button Stop. The control panel
+    shows the state of the clutch and the tracking error.
     """
     from pydrake.visualization import MeshcatPoseSliders  # imports matplotlib
 
@@ -155,7 +161,7 @@ def run_live_teleoperation(meshcat: Meshcat, duration: float = np.inf) -> None:
         follows = bool(arms.GetOutputPort("following").Eval(context)[0])
         tracking = error.update(follows, arms.CalcX_MG(context), arms.CalcX_FT(context), scale)
         scene.draw(arms, context)
-        scene.show_status(follows, scale, tracking)
+        scene.show_status(follows, tracking)
 
 
 class _LiveError:

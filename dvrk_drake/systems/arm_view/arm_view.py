@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, Role
-from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
-from pydrake.systems.framework import Context, DiagramBuilder
+from pydrake.geometry import Meshcat, Role
 
-from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.plant import add_arm, holding_torque, set_arm_positions
-from dvrk_drake.systems.arm_view.camera import home_position
+from dvrk_drake.models.plant import holding_torque, set_arm_positions
+from dvrk_drake.systems.arm_view.camera import close_up, framing, geometry_corners, home_position
 from dvrk_drake.systems.arm_view.controls import JointSliders
+from dvrk_drake.systems.arm_view.drawn_arm import DrawnArm
 from dvrk_drake.systems.arm_view.overlay import ArmOverlay
 
-#: Buttons of the view, besides those of the camera positions.
-FRAMES, NAMES, EFFORTS = "frames", "joint names", "gravity efforts"
-HOME, RANDOM, DEGREES = "home pose", "random pose", "degrees / radians"
-#: Upper edge of the caption of a coupled limit, see `Camera.point`.
-LIMIT_EDGE = 0.74
+#: Buttons of the view, and sliders that are 0 (off) or 1 (on), so that they show their state.
+WHOLE_ARM, HOME, RANDOM = "whole arm", "home pose", "random pose"
+FRAMES, EFFORTS, DEGREES = "frames", "gravity efforts", "degrees, mm"
+#: Length of the axes of the frames, as a multiple of the size of the arm.
+_AXIS = 0.07
+#: Size of arcs and frames on the screen in a close-up, as a multiple of their size in the view of the whole arm.
+_CLOSE_UP = 3.0
 
 
 class ArmView:
@@ -35,7 +35,7 @@ class ArmView:
     """
 
     def __init__(self, arm: Arm, meshcat: Meshcat, role: Role = Role.kIllustration) -> None:
-        """Draws an arm at its home pose: all joints at zero, or at the limit nearest to zero.
+        """Draws an arm in the first pose of a view, see `home_position`.
 
         Args:
             arm: Arm to draw.
@@ -46,24 +46,22 @@ class ArmView:
             ArmError: The arm has no geometry with this role.
         """
         self.arm, self.meshcat = arm, meshcat
-        builder = DiagramBuilder()
-        self._plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=1e-3)
-        add_arm(self._plant, arm)
-        self._plant.Finalize()
-        if scene_graph.model_inspector().NumGeometriesWithRole(role) == 0:
-            raise ArmError(f"{arm.name} has no {'visual' if role == Role.kIllustration else 'collision'} geometry")
-        parameters = MeshcatVisualizerParams(role=role, prefix=f"{arm.name.lower()}/links")
-        MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat, parameters)
-        self._diagram = builder.Build()
-        self._context = self._diagram.CreateDefaultContext()
+        self._path = arm.name.lower()
+        self._links = DrawnArm(arm, meshcat, f"{self._path}/links", role=role)
         self.overlay = ArmOverlay(arm, meshcat)
-        self.overlay.set_title(arm.name)
+        self._frames: DrawnArm | None = None
         self._q = home_position(arm)
         self._sliders: JointSliders | None = None
         self._clicks: dict[str, int] = {}
-        self._shown = {FRAMES: False, NAMES: False, EFFORTS: False}
+        self._switches: dict[str, float] = {}
         self._generator = np.random.default_rng()
+        self._scale = 1.0
         self.show(self._q)
+
+    @property
+    def camera_presets(self) -> tuple[str, ...]:
+        """Names of camera positions for `look_at`: the whole arm, and the close-ups of the arm's file."""
+        return (WHOLE_ARM, *self.arm.view.close_ups)
 
     def show(self, q: ArrayLike, *, effort: ArrayLike | None = None, desired: ArrayLike | None = None) -> None:
         """Draws the pose q (n,) [rad, m], which may be outside the limits.
@@ -74,17 +72,42 @@ class ArmView:
             desired: Pose (n,) [rad, m] of the ghost. None: no ghost.
         """
         self._q = np.array(q, dtype=float)
-        set_arm_positions(self._plant, self._plant_context(), self.arm, self._q)
-        self._diagram.ForcedPublish(self._context)
+        for drawn in filter(None, (self._links, self._frames)):
+            drawn.draw(self._q)
         self.overlay.draw(self._q, effort=effort, desired=desired)
 
+    def look_at(self, preset: str) -> None:
+        """Moves the camera to one of `camera_presets`. A close-up shows its links at the pose that was drawn last."""
+        position, target = framing(self.arm)
+        whole_distance = np.linalg.norm(position - target)
+        if (links := self.arm.view.close_ups.get(preset)) is not None:
+            position, target = close_up(self.arm, self._q, tuple(links))
+        # In a close-up, arcs and frames would otherwise be larger than the links.
+        self._scale = min(1.0, _CLOSE_UP * float(np.linalg.norm(position - target) / whole_distance))
+        self.overlay.resize(self._scale)
+        if self._frames is not None:
+            self.show_frames(True)
+        self.meshcat.SetCameraPose(position, target)
+
+    def show_frames(self, visible: bool) -> None:
+        """Shows or hides the frames of the DH convention (x red, y green, z blue); see `main_frames`."""
+        path = f"{self._path}/frames"
+        self.meshcat.Delete(path)
+        self._frames = None
+        if visible:
+            length = _AXIS * self._scale * float(np.ptp(geometry_corners(self.arm), axis=0).max())
+            self._frames = DrawnArm(self.arm, self.meshcat, path, axis_length=length)
+            self._frames.draw(self._q)
+
     def add_view_buttons(self) -> None:
-        """Adds buttons for the camera positions, and for frames and joint names."""
-        self._add_buttons(*self.overlay.camera_presets, FRAMES, NAMES)
+        """Adds buttons for the camera positions, and a switch for the frames."""
+        self._add_buttons(*self.camera_presets)
+        self._add_switches(FRAMES)
 
     def add_sliders(self) -> None:
-        """Adds buttons for poses, units and gravity efforts, and one slider per independent joint."""
-        self._add_buttons(EFFORTS, HOME, RANDOM, DEGREES)
+        """Adds buttons for poses, switches for units and gravity efforts, and one slider per independent joint."""
+        self._add_buttons(HOME, RANDOM)
+        self._add_switches(EFFORTS, DEGREES)
         self._sliders = JointSliders(self.arm, self.meshcat, self._q)
 
     def follow_controls(self) -> NDArray[np.float64]:
@@ -94,12 +117,16 @@ class ArmView:
             if clicks != self._clicks[button]:
                 self._clicks[button] = clicks
                 self._press(button)
+        for switch in self._switches:
+            value = self.meshcat.GetSliderValue(switch)
+            if value != self._switches[switch]:
+                self._switches[switch] = value
+                self._turn(switch, bool(value))
         if self._sliders is not None:
             q = self._sliders.positions()
-            self.overlay.captions.set_text("limit", self._sliders.stopped_by, v=LIMIT_EDGE)
             if not np.array_equal(q, self._q):
+                self.overlay.set_state(self._sliders.stopped_by or self._describe(int(np.abs(q - self._q).argmax())))
                 self.show(q, effort=self._gravity_effort(q))
-        self.overlay.follow_camera()
         return self._q
 
     def _add_buttons(self, *names: str) -> None:
@@ -107,34 +134,38 @@ class ArmView:
             self.meshcat.AddButton(name)
             self._clicks[name] = 0
 
+    def _add_switches(self, *names: str) -> None:
+        for name in names:
+            self._switches[name] = self.meshcat.AddSlider(name, 0.0, 1.0, 1.0, 0.0)
+
     def _press(self, button: str) -> None:
-        if button in self._shown:
-            self._shown[button] = not self._shown[button]
-        if button in self.overlay.camera_presets:
-            self.overlay.look_at(button)
-        elif button == FRAMES:
-            self.overlay.show_frames(self._shown[FRAMES])
-        elif button == NAMES:
-            self.overlay.show_names(self._shown[NAMES])
+        if button in self.camera_presets:
+            self.look_at(button)
         elif self._sliders is not None:
-            if button == EFFORTS:
-                self.overlay.show_efforts(self._shown[EFFORTS])
-                self.show(self._q, effort=self._gravity_effort(self._q))
-            elif button == DEGREES:
-                self._sliders.set_degrees(not self._sliders.degrees)
-            else:
-                self.overlay.clear_trace()
-                q = home_position(self.arm)
-                if button == RANDOM:
-                    (q,) = self.arm.sample_poses(1, self._generator, margin=0.02)
-                self._sliders.set_positions(q)
+            self.overlay.clear_trace()
+            q = home_position(self.arm)
+            if button == RANDOM:
+                (q,) = self.arm.sample_poses(1, self._generator, margin=0.02)
+            self._sliders.set_positions(q)
+
+    def _turn(self, switch: str, on: bool) -> None:
+        if switch == FRAMES:
+            self.show_frames(on)
+        elif switch == DEGREES and self._sliders is not None:
+            self._sliders.set_degrees(on)
+        elif switch == EFFORTS:
+            self.overlay.show_efforts(on)
+            self.show(self._q, effort=self._gravity_effort(self._q))
+
+    def _describe(self, joint: int) -> str:
+        """Returns name and range of a joint, for the control panel."""
+        unit = "m" if self.arm.prismatic[joint] else "rad"
+        lower, upper = self.arm.position_lower[joint], self.arm.position_upper[joint]
+        return f"{self.arm.joint_names[joint]}: {lower:.3g} to {upper:.3g} {unit}"
 
     def _gravity_effort(self, q: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Returns the efforts (n,) [N m, N] that hold the arm, or None if they are not shown."""
-        if not self._shown[EFFORTS]:
+        if not self._switches.get(EFFORTS):
             return None
-        set_arm_positions(self._plant, self._plant_context(), self.arm, q)
-        return holding_torque(self._plant, self._plant_context(), self.arm)
-
-    def _plant_context(self) -> Context:
-        return self._plant.GetMyMutableContextFromRoot(self._context)
+        set_arm_positions(self._links.plant, self._links.context, self.arm, q)
+        return holding_torque(self._links.plant, self._links.context, self.arm)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
 from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.geometry import Role
-from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 
@@ -31,46 +29,6 @@ HALF_HEIGHT, ASPECT = np.tan(np.radians(75 / 2)) / ZOOM, 1.2
 SHARE, MARGIN = 0.75, 1.05
 #: Smallest width of a close-up [m].
 _LEAST_WIDTH = 0.02
-
-
-@dataclass(frozen=True, eq=False)
-class Camera:
-    """Pose of a camera.
-
-    Attributes:
-        X_WC: Pose of the camera. Its x axis points to the right of the view, y up, and z away from the target.
-        distance: Distance to the target [m].
-    """
-
-    X_WC: RigidTransform
-    distance: float
-
-    @staticmethod
-    def looking_at(position: ArrayLike, target: ArrayLike) -> Camera:
-        """Returns the camera at `position` (3,) that looks at `target` (3,) [m]. The z axis of the world points up."""
-        position, target = np.asarray(position, float), np.asarray(target, float)
-        back = position - target
-        distance = float(np.linalg.norm(back))
-        back /= distance
-        right = np.cross([0.0, 0.0, 1.0], back)
-        right = np.array([0.0, 1.0, 0.0]) if np.linalg.norm(right) < 1e-9 else right / np.linalg.norm(right)
-        R_WC = RotationMatrix(np.column_stack([right, np.cross(back, right), back]))
-        return Camera(RigidTransform(R_WC, position), distance)
-
-    def point(self, u: float, v: float, depth: float) -> NDArray[np.float64]:
-        """Returns a point (3,) [m] in the world from its place in the view.
-
-        Args:
-            u: Distance from the middle of the view to the right, as a multiple of half the height of the view.
-            v: Distance from the middle of the view upwards, as a multiple of half the height of the view.
-            depth: Distance from the camera along the view direction [m].
-        """
-        return np.asarray(self.X_WC @ (depth * np.array([u * HALF_HEIGHT, v * HALF_HEIGHT, -1.0])))
-
-    def place(self, p_W: ArrayLike) -> tuple[float, float, float]:
-        """Returns u, v and depth [m] of a point (3,) [m] in the world, see `point`."""
-        x, y, z = self.X_WC.inverse() @ np.asarray(p_W, float)
-        return x / (-z * HALF_HEIGHT), y / (-z * HALF_HEIGHT), -z
 
 
 def framing(arm: Arm) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

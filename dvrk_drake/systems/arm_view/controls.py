@@ -1,4 +1,4 @@
-"""Sliders for the joints of an arm in Meshcat."""
+"""Controls of a view in Meshcat's control panel: sliders for the joints, and texts."""
 
 from __future__ import annotations
 
@@ -9,11 +9,34 @@ from pydrake.geometry import Meshcat
 from dvrk_drake.models.arm import Arm
 
 
+class PanelText:
+    """Row of the control panel with a text that changes.
+
+    It is a button without effect, because the panel has no texts. Meshcat adds it below the other rows.
+    """
+
+    def __init__(self, meshcat: Meshcat) -> None:
+        """Starts without a text."""
+        self._meshcat, self._text = meshcat, ""
+
+    def show(self, text: str) -> None:
+        """Replaces the text. "" removes the row."""
+        if text == self._text:
+            return
+        if self._text:
+            self._meshcat.DeleteButton(self._text, strict=False)
+        if text:
+            self._meshcat.AddButton(text)
+        self._text = text
+
+
 class JointSliders:
     """One slider per independent joint, from its lower to its upper limit.
 
+    The unit follows the number of the joint, because Meshcat cuts labels after 14 characters.
+
     Attributes:
-        names: Names of the sliders, with their units.
+        names: Names of the sliders: number, unit and name of each joint.
         degrees: Whether revolute joints have degrees, and prismatic joints mm. Otherwise, the units are rad and m.
         stopped_by: Description of the coupled limits that stopped the sliders, or "".
     """
@@ -31,10 +54,10 @@ class JointSliders:
         self._unit = self._arm.per_joint(np.radians(1.0), 1e-3) if self.degrees else np.ones(self._arm.num_joints)
         units = ("deg", "mm") if self.degrees else ("rad", "m")
         joints = enumerate(zip(self._arm.joint_names, self._arm.prismatic, strict=True), 1)
-        self.names = [f"q{i} {name} [{units[int(slides)]}]" for i, (name, slides) in joints]
+        self.names = [f"q{i} [{units[int(slides)]}] {name}" for i, (name, slides) in joints]
         lower, upper = self._arm.position_lower / self._unit, self._arm.position_upper / self._unit
+        step = 0.1 if self.degrees else 0.001  # Meshcat shows five characters of the value
         for i, name in enumerate(self.names):
-            step = (upper[i] - lower[i]) / 1000
             self._meshcat.AddSlider(name, lower[i], upper[i], step, self._q[i] / self._unit[i])
 
     def set_degrees(self, degrees: bool) -> None:
@@ -82,5 +105,5 @@ class JointSliders:
             if end != allowed:
                 stopped = a != 0
                 q[stopped] = (self._q + (allowed - start) / (end - start) * (q - self._q))[stopped]
-                stops.append(f"stopped by the limit {limit.name}: {least:.4g} to {most:.4g} rad")
+                stops.append(f"stop: {limit.name} {least:.4g} to {most:.4g} rad")
         return q, "; ".join(stops)

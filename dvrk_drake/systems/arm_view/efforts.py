@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydrake.geometry import Rgba
+from pydrake.geometry import Meshcat, Rgba
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.framework import Context
 
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.systems.arm_view.joints import ArmJoints
-from dvrk_drake.systems.arm_view.scene import Scene
+from dvrk_drake.systems.arm_view.visibility import Visibility
 
 #: Shares of the effort limit that are drawn, and angle of an arc at the effort limit [rad].
 LEVELS = (0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
@@ -28,10 +32,6 @@ def share_color(share: float) -> NDArray[np.float64]:
     return np.array([np.interp(share, (0.0, 0.5, 1.0), channel) for channel in _STOPS.T])
 
 
-def _rgba(share: float) -> Rgba:
-    return Rgba(*share_color(share), 1.0)
-
-
 class EffortArcs:
     """One arc per joint around its axis. A prismatic joint has a straight arrow instead.
 
@@ -39,47 +39,63 @@ class EffortArcs:
     the direction of the effort. A thin line shows the length of a positive effort at the limit.
     """
 
-    def __init__(self, arm: Arm, joints: ArmJoints, scene: Scene, radii: NDArray[np.float64]) -> None:
-        """Adds the arcs. `radii` (n,) are their radii [m]."""
-        self._arm, self._joints, self._scene = arm, joints, scene
+    def __init__(self, arm: Arm, meshcat: Meshcat, path: str, radii: NDArray[np.float64], shown: Visibility) -> None:
+        """Adds the arcs below a path of Meshcat. `radii` (n,) are their radii [m]."""
+        self._arm, self._meshcat, self._path, self._visibility = arm, meshcat, path, shown
         self._levels = np.zeros(arm.num_joints, int)
-        scene.set_visible("efforts", False)
         for i, name in enumerate(arm.joint_names):
             scale = _line(1.0, radii[i]) if arm.prismatic[i] else _arc(1.0, radii[i])
-            scene.meshcat.SetLine(scene.path(f"efforts/{name}/scale"), np.asfortranarray(scale), 2.0, SCALE_COLOR)
+            meshcat.SetLine(f"{path}/{name}/scale", np.asfortranarray(scale), 2.0, SCALE_COLOR)
             for level, share in enumerate(LEVELS[1:], 1):
+                color = Rgba(*share_color(share))
                 points = _line(share, radii[i]) if arm.prismatic[i] else _arc(share, radii[i])
                 vertices, faces = _arrow(points, radii[i])
                 reversed_axis = 2 if arm.prismatic[i] else 1
                 for sign in (1, -1):
-                    path = f"efforts/{name}/{sign * level}"
+                    arc = f"{path}/{name}/{sign * level}"
                     vertices[reversed_axis] *= sign
-                    scene.meshcat.SetTriangleMesh(
-                        scene.path(path), np.asfortranarray(vertices), np.asfortranarray(faces), _rgba(share)
-                    )
-                    scene.set_visible(path, False)
+                    meshcat.SetTriangleMesh(arc, np.asfortranarray(vertices), np.asfortranarray(faces), color)
+                    shown.set(arc, False)
 
     def draw(self, effort: ArrayLike, time: float | None = None) -> None:
         """Draws the efforts (n,) [N m, N]. A recording stores them at `time` [s]."""
         share = np.asarray(effort, float) / self._arm.effort_limits
         nearest = np.searchsorted((np.array(LEVELS[1:]) + LEVELS[:-1]) / 2, np.abs(np.nan_to_num(share)))
         levels = (np.sign(np.nan_to_num(share)) * nearest).astype(int)
-        for i, name in enumerate(self._arm.joint_names):
-            if levels[i] != self._levels[i]:
-                for level, visible in ((self._levels[i], False), (levels[i], True)):
+        for name, before, after in zip(self._arm.joint_names, self._levels, levels, strict=True):
+            if before != after:
+                for level in (before, after):
                     if level:
-                        self._scene.set_visible(f"efforts/{name}/{level}", visible, time)
+                        self._visibility.set(f"{self._path}/{name}/{level}", bool(level == after), time)
         self._levels = levels
 
-    def move(self, time: float | None = None, scale: float = 1.0) -> None:
-        """Moves the arcs to the pose of the joints, and scales them. A recording stores the pose at `time` [s]."""
-        for name, X_BJ in zip(self._arm.joint_names, self._joints.axis_frames(), strict=True):
-            self._scene.set_transform(f"efforts/{name}", X_BJ, time, scale)
+    def move(self, X_BJ: Sequence[RigidTransform], time: float | None = None, scale: float = 1.0) -> None:
+        """Moves the arcs to the poses of `axis_frames`, and scales them.
+
+        A recording stores the poses at `time` [s]. It cannot store a scale other than 1.
+        """
+        for name, X in zip(self._arm.joint_names, X_BJ, strict=True):
+            if scale == 1.0:
+                self._meshcat.SetTransform(f"{self._path}/{name}", X, time)
+            else:
+                matrix = X.GetAsMatrix4() * [[scale, scale, scale, 1.0]]
+                self._meshcat.SetTransform(f"{self._path}/{name}", np.asfortranarray(matrix))
 
     @property
     def shares(self) -> NDArray[np.float64]:
         """Shares (n,) of the effort limits that are drawn."""
         return np.sign(self._levels) * np.array(LEVELS)[np.abs(self._levels)]
+
+
+def axis_frames(arm: Arm, plant: MultibodyPlant, context: Context) -> list[RigidTransform]:
+    """Returns one pose per joint: origin of the joint, z along its axis, and x fixed to the parent link."""
+    poses = []
+    for name in arm.joint_names:
+        joint = plant.GetJointByName(name)
+        axis = joint.translation_axis() if joint.type_name() == "prismatic" else joint.revolute_axis()
+        X_FJ = RigidTransform(RotationMatrix.MakeFromOneVector(np.asarray(axis, float), 2))
+        poses.append(joint.frame_on_parent().CalcPoseInWorld(context) @ X_FJ)
+    return poses
 
 
 def _arc(share: float, radius: float) -> NDArray[np.float64]:

@@ -48,14 +48,13 @@ class OverlayPublisher(LeafSystem):
     def _draw(self, context: Context) -> EventStatus:
         n, time = self._overlay.arm.num_joints, context.get_time()
         effort, desired = self.GetInputPort("effort"), self.GetInputPort("desired_state")
-        self._overlay.set_phase(self._phase(time), time)
+        self._overlay.set_state(self._phase(time))
         self._overlay.draw(
             self.GetInputPort("state").Eval(context)[:n],
             effort=effort.Eval(context) if effort.HasValue(context) else None,
             desired=desired.Eval(context)[:n] if desired.HasValue(context) else None,
             time=time,
         )
-        self._overlay.follow_camera()
         return EventStatus.Succeeded()
 
 
@@ -66,7 +65,7 @@ def add_overlay(
     desired: OutputPort | None = None,
     phase: Callable[[float], str] = lambda time: "",
 ) -> OverlayPublisher:
-    """Adds an `OverlayPublisher` for a station to a diagram. It shows the measured efforts and the arm's name.
+    """Adds an `OverlayPublisher` for a station to a diagram. It shows the measured efforts.
 
     Args:
         builder: Builder with the station.
@@ -76,7 +75,6 @@ def add_overlay(
         phase: Function that returns the name of the phase at a time [s].
     """
     name = station.arm.name.lower()
-    overlay.set_title(station.arm.name)
     publisher = builder.AddNamedSystem(f"{name}_overlay", OverlayPublisher(overlay, phase))
     builder.Connect(station.GetOutputPort(f"{name}.state_true"), publisher.GetInputPort("state"))
     builder.Connect(station.GetOutputPort(f"{name}.effort_measured"), publisher.GetInputPort("effort"))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import gc
 import html
+import json
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,6 +15,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.systems.arm_view.camera import ZOOM, framing, geometry_corners
+from dvrk_drake.systems.arm_view.efforts import share_color
 
 #: Colours of the background. Light castings and dark motors of an arm stand out from both.
 TOP, BOTTOM = [0.36, 0.45, 0.55], [0.62, 0.69, 0.75]
@@ -100,14 +103,54 @@ def add_ground(meshcat: Meshcat, p_WC: NDArray[np.float64], gravity: ArrayLike =
     meshcat.SetTransform("grid", X_WG)
 
 
-def tracked_url(meshcat: Meshcat) -> str:
-    """Returns the address of the page on which texts follow the camera."""
-    return f"{meshcat.web_url()}/?tracked_camera=on"
+def page_html(
+    meshcat: Meshcat,
+    title: str,
+    *,
+    phases: Sequence[tuple[float, str]] = (),
+    colors: Mapping[str, str] | None = None,
+    effort_scale: bool = False,
+) -> str:
+    """Returns the page with its recorded animation as one HTML document.
 
+    The title of a page that Meshcat serves cannot be changed: it is fixed in Drake's HTML document.
 
-def page_html(meshcat: Meshcat, title: str) -> str:
-    """Returns the page with its recorded animation as one HTML document with this title.
-
-    The title of the served page cannot be changed: it is fixed in Drake's HTML document.
+    Args:
+        meshcat: Meshcat with the scene.
+        title: Title of the page.
+        phases: Start times [s] and names of the phases of the animation. The page shows the current one.
+        colors: CSS colours and their meanings, e.g. {"green": "model of the SDF"}.
+        effort_scale: Whether the page explains the colours of the efforts.
     """
-    return str(meshcat.StaticHtml()).replace("<title>Drake MeshCat</title>", f"<title>{html.escape(title)}</title>", 1)
+    gradient = ", ".join(f"rgb({', '.join(f'{255 * c:.0f}' for c in share_color(share))})" for share in (0.0, 0.5, 1.0))
+    legend = "".join(
+        f'<div><i style="background: {color}"></i>{html.escape(text)}</div>' for color, text in (colors or {}).items()
+    )
+    if effort_scale:
+        legend += (
+            f'<div>effort 0 <i class="scale" style="background: linear-gradient(90deg, {gradient})"></i>limit</div>'
+        )
+    captions = _CAPTIONS.replace("LEGEND", legend).replace("PHASES", json.dumps(list(phases)))
+    page = str(meshcat.StaticHtml()).replace("<title>Drake MeshCat</title>", f"<title>{html.escape(title)}</title>", 1)
+    return page.replace("</body>", captions + "</body>", 1) if phases or legend else page
+
+
+#: Texts in the upper left corner of a page, which change with the time of the animation. The control panel is right.
+_CAPTIONS = """
+<style>
+  #captions { position: fixed; left: 0; top: 0; max-width: calc(100% - 16px); padding: 6px 12px; color: #141a21;
+              background: rgba(255, 255, 255, 0.85); font: 15px/1.5 system-ui, "DejaVu Sans", sans-serif; }
+  #captions i { display: inline-block; width: 12px; height: 12px; margin-right: 8px; border: 1px solid #141a21; }
+  #captions i.scale { width: 90px; margin: 0 6px 0 2px; }
+</style>
+<div id="captions"><b id="phase"></b>LEGEND</div>
+<script>
+  const phases = PHASES;
+  (function showPhase() {
+    const time = Math.max(0, ...viewer.animator.actions.map((action) => action.time));
+    const started = phases.filter(([start]) => start <= time + 1e-6);
+    document.getElementById("phase").textContent = started.length ? started.at(-1)[1] : "";
+    if (phases.length) requestAnimationFrame(showPhase);
+  })();
+</script>
+"""

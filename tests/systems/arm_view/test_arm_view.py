@@ -14,7 +14,7 @@ from dvrk_drake.errors import ControllerError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes.live_view import show_status
-from dvrk_drake.systems.arm_view.arm_view import ArmView
+from dvrk_drake.systems.arm_view.arm_view import DEGREES, FRAMES, ArmView
 from dvrk_drake.systems.arm_view.page import start_meshcat
 
 pytestmark = pytest.mark.drake_api
@@ -29,8 +29,7 @@ def view():
 
 def test_dependent_joints_follow(view):
     view.show([0.1, 0.3, -0.2, 0.4, 0.5, 0.3, 0.2])
-    plant = view._plant
-    context = plant.GetMyContextFromRoot(view._context)
+    plant, context = view._links.plant, view._links.context
     (loop,) = view.arm.loop_closures
     gap = plant.GetFrameByName(loop.frame_a).CalcPose(context, plant.GetFrameByName(loop.frame_b)).translation()
     assert np.linalg.norm(gap) < 1e-12
@@ -39,16 +38,16 @@ def test_dependent_joints_follow(view):
 
 def test_sliders_stop_at_the_coupled_limit(view):
     for i, name in enumerate(view.arm.joint_names):
-        view.meshcat.SetSliderValue(f"q{i + 1} {name} [rad]", 0.0)
+        view.meshcat.SetSliderValue(f"q{i + 1} [rad] {name}", 0.0)
     view.follow_controls()
-    view.meshcat.SetSliderValue("q2 shoulder_pitch [rad]", 0.6)
+    view.meshcat.SetSliderValue("q2 [rad] shoulder_pitch", 0.6)
     q = view.follow_controls()
     assert q[1] == pytest.approx(0.6, abs=2e-3)
-    view.meshcat.SetSliderValue("q3 elbow_pitch [rad]", 0.6)
+    view.meshcat.SetSliderValue("q3 [rad] elbow_pitch", 0.6)
     q = view.follow_controls()
     assert q[1] + q[2] <= 0.68 + 2e-3
     assert q[1] + q[2] > 0.6
-    assert view.meshcat.GetSliderValue("q3 elbow_pitch [rad]") == pytest.approx(q[2])
+    assert view.meshcat.GetSliderValue("q3 [rad] elbow_pitch") == pytest.approx(q[2])
 
 
 def test_other_sliders_move_at_the_coupled_limit(view):
@@ -59,36 +58,52 @@ def test_other_sliders_move_at_the_coupled_limit(view):
     view.follow_controls()
     with np.errstate(all="raise"):
         for wanted in (0.2, 0.4):
-            view.meshcat.SetSliderValue("q1 outer_yaw [rad]", wanted)
-            view.meshcat.SetSliderValue("q3 elbow_pitch [rad]", 0.6)
+            view.meshcat.SetSliderValue("q1 [rad] outer_yaw", wanted)
+            view.meshcat.SetSliderValue("q3 [rad] elbow_pitch", 0.6)
             q = view.follow_controls()
             assert q[0] == pytest.approx(wanted, abs=2e-3)
             assert 0.67 < q[1] + q[2] < 0.685
-    assert view._sliders.stopped_by == "stopped by the limit parallelogram: -0.33 to 0.68 rad"
-    view.meshcat.SetSliderValue("q3 elbow_pitch [rad]", 0.1)
+    assert view._sliders.stopped_by == "stop: parallelogram -0.33 to 0.68 rad"
+    view.meshcat.SetSliderValue("q3 [rad] elbow_pitch", 0.1)
     assert view.follow_controls()[2] == pytest.approx(0.1, abs=2e-3)
     assert view._sliders.stopped_by == ""
+
+
+def test_switches_and_camera_positions(view):
+    view.add_view_buttons()
+    assert view.camera_presets == ("whole arm", "gimbal")
+    for value in (1.0, 0.0):
+        view.meshcat.SetSliderValue(FRAMES, value)
+        view.follow_controls()
+        assert view.meshcat.HasPath("/drake/mtml/frames/mtml") == bool(value)
+    view.meshcat.SetSliderValue(DEGREES, 1.0)
+    np.testing.assert_allclose(view.follow_controls(), view._q, rtol=0, atol=1e-12)
+    assert view._sliders.names[1] == "q2 [deg] shoulder_pitch"
+    view.meshcat.SetSliderValue(DEGREES, 0.0)
+    view.follow_controls()
+    view.meshcat.SetSliderValue("q5 [rad] wrist_pitch", 0.2)
+    view.follow_controls()
+    assert view.meshcat.GetButtonClicks(view._describe(4)) == 0, "the control panel shows name and range"
 
 
 def test_psm_sliders_move_joints_and_linkage():
     view = ArmView(load_arm("psm"), start_meshcat())
     view.add_sliders()
     assert view._sliders.names == [
-        "q1 yaw [rad]",
-        "q2 pitch [rad]",
-        "q3 insertion [m]",
-        "q4 roll [rad]",
-        "q5 wrist_pitch [rad]",
-        "q6 wrist_yaw [rad]",
-        "q7 jaw [rad]",
+        "q1 [rad] yaw",
+        "q2 [rad] pitch",
+        "q3 [m] insertion",
+        "q4 [rad] roll",
+        "q5 [rad] wrist_pitch",
+        "q6 [rad] wrist_yaw",
+        "q7 [rad] jaw",
     ]
     assert view._q[2] == pytest.approx(0.1), "the instrument is visible"
     wanted = [-0.7, 0.6, 0.15, 2.0, -0.5, 0.8, 0.9]
     for name, value in zip(view._sliders.names, wanted, strict=True):
         view.meshcat.SetSliderValue(name, value)
     np.testing.assert_allclose(view.follow_controls(), wanted, atol=6e-3)  # a slider has steps of 1/1000 of its range
-    plant = view._plant
-    context = plant.GetMyContextFromRoot(view._context)
+    plant, context = view._links.plant, view._links.context
     for loop in view.arm.loop_closures:
         A, B = plant.GetFrameByName(loop.frame_a), plant.GetFrameByName(loop.frame_b)
         assert np.linalg.norm(A.CalcPose(context, B).translation()) < 1e-12
@@ -123,7 +138,7 @@ def test_live_view_draws_the_last_status():
         show_status(view, link)
         np.testing.assert_array_equal(view._q, pose)  # last drawn pose
     np.testing.assert_array_equal(view.overlay._efforts.shares, 0.5)
-    assert view.meshcat.HasPath("/drake/mtml/overlay/ghost/desired/forearm_link")
+    assert view.meshcat.HasPath("/drake/mtml/overlay/ghost/desired/mtml/forearm_link")
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends a process with its parent")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.systems.arm_view.camera import ASPECT, HALF_HEIGHT, Camera, close_up, framing, geometry_corners
+from dvrk_drake.systems.arm_view.camera import ASPECT, HALF_HEIGHT, close_up, framing, geometry_corners
 from dvrk_drake.systems.arm_view.page import start_meshcat
 
 pytestmark = pytest.mark.drake_api
@@ -21,13 +21,6 @@ def test_camera_frames_the_whole_arm(name):
     share = np.maximum(np.abs(seen @ right) / ASPECT, np.abs(seen @ np.cross(right, forward))) / half_height
     assert (half_height > 0).all()
     assert 0.8 < share.max() < 1.0
-
-
-def test_place_inverts_point():
-    camera = Camera.looking_at([1.0, -2.0, 0.5], [0.1, 0.2, 0.3])
-    np.testing.assert_allclose(camera.place(camera.point(0.3, -0.6, 1.7)), (0.3, -0.6, 1.7), rtol=0, atol=1e-12)
-    np.testing.assert_allclose(camera.place([0.1, 0.2, 0.3]), (0, 0, camera.distance), rtol=0, atol=1e-12)
-    assert camera.place([0.1, 0.2, 0.4])[1] > 0  # the world's z axis points up
 
 
 def test_close_up_is_nearer_than_the_whole_arm():

@@ -1,4 +1,4 @@
-"""Overlay: ghost, efforts, frames, texts, recording, and drawing in a simulation."""
+"""Overlay: ghost, efforts, texts, recording, and drawing in a simulation."""
 
 import gc
 import threading
@@ -6,34 +6,23 @@ import threading
 import numpy as np
 import pytest
 from forked import run_forked
-from pydrake.math import RigidTransform
 
 import dvrk_drake as dvrk
 from dvrk_drake.errors import ArmError, DvrkDrakeError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import set_arm_positions, shared_plant
 from dvrk_drake.models.sdf_model import MODELS_FOLDER
+from dvrk_drake.reports import colours
 from dvrk_drake.systems.arm_view import page
-from dvrk_drake.systems.arm_view.camera import Camera
-from dvrk_drake.systems.arm_view.efforts import LEVELS, share_color
-from dvrk_drake.systems.arm_view.joints import ArmJoints
-from dvrk_drake.systems.arm_view.overlay import ArmOverlay
-from dvrk_drake.systems.arm_view.page import page_html, start_meshcat
-from dvrk_drake.systems.arm_view.text import image_mesh, text_image
+from dvrk_drake.systems.arm_view.drawn_arm import COMMANDED
+from dvrk_drake.systems.arm_view.efforts import LEVELS, axis_frames
+from dvrk_drake.systems.arm_view.overlay import TRACE_COLOR, ArmOverlay
+from dvrk_drake.systems.arm_view.page import start_meshcat
+from dvrk_drake.systems.arm_view.visibility import Visibility
 
 pytestmark = pytest.mark.drake_api
 
 HOME = {"mtml": np.zeros(7), "psm": np.array([0, 0, 0.1, 0, 0, 0, 0])}
-
-
-class Recorder:
-    """Meshcat that counts messages by method."""
-
-    def __init__(self):
-        self.calls = []
-
-    def __getattr__(self, name):
-        return lambda *args, **kwargs: self.calls.append((name, *args)) if name != "GetTrackedCameraPose" else None
 
 
 @pytest.mark.parametrize("views", [1, 3])
@@ -56,10 +45,6 @@ def test_view_is_not_destroyed_in_another_thread(views, monkeypatch):
     run_forked(check)
 
 
-def transforms(meshcat, part):
-    return [call for call in meshcat.calls if call[0] == "SetTransform" and part in call[1]]
-
-
 @pytest.mark.parametrize("name", ["mtml", "psm"])
 def test_effort_share_selects_the_nearest_arc(name):
     arm = load_arm(name)
@@ -75,11 +60,10 @@ def test_arc_points_in_the_direction_of_the_effort():
     for name in ("mtmr", "psm"):
         arm, plant = load_arm(name), shared_plant(load_arm(name))
         (q,) = arm.sample_poses(1, np.random.default_rng(0))
-        joints = ArmJoints(arm)
-        joints.set_positions(q)
         context = plant.CreateDefaultContext()
         set_arm_positions(plant, context, arm, q)
-        for joint_name, X_BJ, slides in zip(arm.joint_names, joints.axis_frames(), arm.prismatic, strict=True):
+        poses = axis_frames(arm, plant, context)
+        for joint_name, X_BJ, slides in zip(arm.joint_names, poses, arm.prismatic, strict=True):
             joint = plant.GetJointByName(joint_name)
             v = np.zeros(plant.num_velocities())
             v[joint.velocity_start()] = 1.0
@@ -90,86 +74,50 @@ def test_arc_points_in_the_direction_of_the_effort():
             np.testing.assert_allclose(X_BJ.rotation().col(2), axis, rtol=0, atol=1e-9)
 
 
-def test_frames_are_those_of_the_dvrk():
-    assert ArmJoints(load_arm("mtml")).frame_names == [f"dh_{i}" for i in range(8)]
-    assert ArmJoints(load_arm("psm")).frame_names == [f"dh_{i}" for i in range(7)]
-
-
 def test_ghost_links_at_the_place_of_the_arm_are_hidden():
-    arm = load_arm("mtml")
-    overlay = ArmOverlay(arm, start_meshcat())
+    overlay = ArmOverlay(load_arm("mtml"), start_meshcat())
     q = np.zeros(7)
     q[2] = 0.2
     overlay.draw(np.zeros(7), desired=q)
-    visible = overlay._scene._visible
-    assert not visible["ghost/desired/upper_arm_link"]  # not moved by the elbow
-    assert visible["ghost/desired/forearm_link"]
+    ghost = overlay._ghosts["desired"]
+
+    def shown(link):
+        return overlay._visibility._visible[ghost.link_path(link)]
+
+    assert not shown("upper_arm_link")  # not moved by the elbow
+    assert shown("forearm_link")
+    assert overlay.meshcat.HasPath(f"/drake/{ghost.link_path('forearm_link')}")
     overlay.draw(np.zeros(7), desired=np.zeros(7))
-    assert not visible["ghost/desired/forearm_link"]
+    assert not shown("forearm_link")
     with pytest.raises(DvrkDrakeError, match="unknown ghost other; known: desired"):
         overlay.draw(q, ghosts={"other": q})
 
 
-def test_only_changes_are_sent_without_recording():
-    meshcat, arm = Recorder(), load_arm("psm")
-    overlay = ArmOverlay(arm, meshcat)
-    overlay.draw(HOME["psm"])
-    meshcat.calls.clear()
-    overlay.draw(HOME["psm"])
-    assert transforms(meshcat, "frames") == []
-    overlay.draw(HOME["psm"], time=0.5)
-    assert len(transforms(meshcat, "frames")) == 7  # a recording interpolates between samples
+class Recorder:
+    """Meshcat that stores the properties of a recording, as (time, value) by path."""
+
+    def __init__(self):
+        self.changes = {}
+
+    def SetProperty(self, path, _, value, time):
+        self.changes.setdefault(path, []).append((time, value))
 
 
-def test_recording_stores_the_visibility_before_a_change():
-    """An animation uses its first value also for earlier times, so it requires a value at time 0."""
-    meshcat, arm = Recorder(), load_arm("mtml")
-    overlay = ArmOverlay(arm, meshcat)
-    overlay.set_phase("held", 0.0)
-    overlay.draw(np.zeros(7), effort=np.zeros(7), time=0.0)
-    overlay.set_phase("released", 1.0)
-    overlay.draw(np.zeros(7), effort=0.5 * arm.effort_limits, time=1.0)
-    changes = {}
-    for method, path, *change in meshcat.calls:
-        if method == "SetProperty" and len(change) == 3 and change[2] is not None:
-            changes.setdefault(path.removeprefix("mtml/overlay/"), []).append((change[2], change[1]))
-    assert changes["phase/1"] == [(0.0, False), (0.0, True), (1.0, False)]
-    assert changes["phase/2"] == [(0.0, False), (1.0, True)]
-    assert changes["efforts/elbow_pitch/8"] == [(0.0, False), (1.0, True)]
+def test_recording_stores_visibility_before_a_change_and_at_the_end():
+    """An animation uses its first value also for earlier times, and ends each track at its last value."""
+    visibility = Visibility(meshcat := Recorder())
+    visibility.set("arc", False)
+    for time in (0.5, 0.75):
+        visibility.set("arc", True, time)
+    visibility.set("arc", False, 1.0)
+    visibility.end_recording(4.0)
+    assert meshcat.changes["arc"] == [(None, False), (0.0, False), (0.5, True), (1.0, False), (4.0, False)]
 
 
-def test_saved_page_has_a_title():
-    assert "<title>MTML &amp; &lt;co&gt;</title>" in page_html(start_meshcat(), "MTML & <co>")
-
-
-def test_close_ups_come_from_the_arm_file():
-    assert ArmOverlay(load_arm("mtmr"), start_meshcat()).camera_presets == ("whole arm", "gimbal")
-    assert ArmOverlay(load_arm("psm"), start_meshcat()).camera_presets == ("whole arm", "instrument")
-
-
-def test_text_follows_the_camera():
-    arm = load_arm("mtml")
-    meshcat = Recorder()
-    X_WB = RigidTransform([0.3, 0.2, 0.1])
-    overlay = ArmOverlay(arm, meshcat, X_WB=X_WB)
-    overlay.set_title("MTML")
-    camera = Camera.looking_at([3.0, 0.0, 1.0], [0.0, 0.0, 0.0])
-    overlay.captions.set_camera(camera)
-    matrix = transforms(meshcat, "title")[-1][2]
-    u, _, depth = camera.place(X_WB @ matrix[:3, 3])
-    assert u == pytest.approx(0, abs=1e-9)
-    assert 0 < depth < camera.distance
-    towards_camera = -matrix[:3, 1] / np.linalg.norm(matrix[:3, 1])
-    np.testing.assert_allclose(towards_camera, camera.X_WC.rotation().col(2), rtol=0, atol=1e-9)
-
-
-def test_images():
-    image = text_image("q1\nouter_yaw")
-    assert image.height > text_image("q1").height
-    meshcat = start_meshcat()
-    meshcat.SetObject("text", image_mesh(image, 0.1))
-    assert meshcat.HasPath("/drake/text")
-    assert share_color(0.0)[2] > share_color(1.0)[2]  # blue to red
+def test_colours_are_those_of_plots():
+    for color, plotted in ((COMMANDED, colours.COMMANDED), (TRACE_COLOR, colours.MEASURED)):
+        parts = [int(plotted[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+        np.testing.assert_allclose([color.r(), color.g(), color.b()], parts, rtol=0, atol=5e-3)
 
 
 def test_drawing_does_not_change_a_simulation():
@@ -178,7 +126,7 @@ def test_drawing_does_not_change_a_simulation():
     options = {"effects": False, "duration": 0.2, "targets": [(0.1, [0, 0.1, 0, 0, 0, 0, 0])]}
     drawn = dvrk.simulate(arm, meshcat=meshcat, **options)
     np.testing.assert_allclose(drawn.recording.q, dvrk.simulate(arm, **options).recording.q, rtol=0, atol=1e-12)
-    for part in ("ghost/desired/forearm_link", "efforts/elbow_pitch", "phase/1", "title"):
+    for part in ("ghost/desired/mtml/forearm_link", "efforts/elbow_pitch"):
         assert meshcat.HasPath(f"/drake/mtml/overlay/{part}")
 
 

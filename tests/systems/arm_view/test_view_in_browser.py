@@ -7,9 +7,9 @@ from waiting import wait_until
 
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import set_arm_positions, shared_plant
-from dvrk_drake.systems.arm_view.arm_view import DEGREES, EFFORTS, FRAMES, HOME, NAMES, RANDOM, ArmView
+from dvrk_drake.systems.arm_view.arm_view import DEGREES, EFFORTS, FRAMES, HOME, RANDOM, ArmView
 from dvrk_drake.systems.arm_view.camera import home_position
-from dvrk_drake.systems.arm_view.page import start_meshcat, tracked_url
+from dvrk_drake.systems.arm_view.page import start_meshcat
 
 
 def open_view(open_page, name):
@@ -18,7 +18,7 @@ def open_view(open_page, name):
     view = ArmView(arm, start_meshcat(arm))
     view.add_view_buttons()
     view.add_sliders()
-    page = open_page(tracked_url(view.meshcat))
+    page = open_page(view.meshcat.web_url())
     open_controls(page, 10)
     return arm, view, page
 
@@ -54,8 +54,7 @@ def test_sliders_keep_the_loop_closed(open_page, name):
 @pytest.mark.slow
 def test_buttons_change_the_view(open_page):
     arm, view, page = open_view(open_page, "psm")
-    overlay = f"['drake', '{arm.name.lower()}', 'overlay'"
-    visible = f"viewer.scene_tree.find({overlay}, '{{}}']).object.visible"
+    tree = f"viewer.scene_tree.find(['drake', '{arm.name.lower()}'])"
 
     def click(label):
         clicks = view.meshcat.GetButtonClicks(label)
@@ -63,22 +62,28 @@ def test_buttons_change_the_view(open_page):
         wait_until(lambda: view.meshcat.GetButtonClicks(label) > clicks, f"click on {label}")
         view.follow_controls()
 
-    for label, path in ((FRAMES, "frames"), (NAMES, "names"), (EFFORTS, "efforts")):
-        click(label)
-        page.wait_for(visible.format(path))
+    def turn(label, on):
+        drag(page, label, 0.9 if on else 0.1)
+        wait_until(lambda: view.meshcat.GetSliderValue(label) == on, f"{label} {on}")
+        view.follow_controls()
+
+    turn(FRAMES, True)
+    page.wait_for(f"{tree}.children.frames")
+    turn(EFFORTS, True)
+    page.wait_for(f"{tree}.children.overlay.children.efforts.object.visible")
     click(RANDOM)
     assert not arm.limit_violations(view._q, tolerance=0.02)
     assert np.any(view._q != 0)
     wait_until(lambda: largest_gap(page, arm) < CLOSED, "closed linkage")
-    click(DEGREES)
+    turn(DEGREES, True)
     np.testing.assert_allclose(view.follow_controls(), view._q, rtol=0, atol=1e-12)
     elbow = view._sliders.names[1]
     assert view.meshcat.GetSliderValue(elbow) == pytest.approx(np.degrees(view._q[1]), abs=0.2)
     click(HOME)
     np.testing.assert_allclose(view._q, home_position(arm), rtol=0, atol=0.02)
-    for preset in view.overlay.camera_presets[::-1]:
+    for preset in view.camera_presets[::-1]:
         click(preset)
         page.wait_for(f"viewer.camera.position.length() < {4 if preset == 'whole arm' else 1.5}")
-    click(FRAMES)
-    page.wait_for("!" + visible.format("frames"))
+    turn(FRAMES, False)
+    page.wait_for(f"!{tree}.children.frames")
     assert not page.errors
