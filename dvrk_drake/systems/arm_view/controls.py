@@ -12,7 +12,7 @@ from dvrk_drake.models.arm import Arm
 class PanelText:
     """Row of the control panel with a text that changes.
 
-    It is a button without effect, because the panel has no texts. Meshcat adds it below the other rows.
+    It is a button without effect, because the panel has no texts. Meshcat adds it below the existing rows.
     """
 
     def __init__(self, meshcat: Meshcat) -> None:

@@ -103,7 +103,7 @@ class Recorder:
         self.changes.setdefault(path, []).append((time, value))
 
 
-def test_recording_stores_visibility_before_a_change_and_at_the_end():
+def test_recording_stores_visibility_at_its_ends():
     """An animation uses its first value also for earlier times, and ends each track at its last value."""
     visibility = Visibility(meshcat := Recorder())
     visibility.set("arc", False)
