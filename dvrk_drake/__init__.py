@@ -31,9 +31,10 @@ if TYPE_CHECKING:
     from dvrk_drake.models.environment import Environment
     from dvrk_drake.models.locked_joints import lock_joints
     from dvrk_drake.models.plant import add_arm, set_arm_positions
+    from dvrk_drake.processes.arm_session import Dialog
     from dvrk_drake.processes.calibration import calibrate
     from dvrk_drake.processes.collector import CollectionSettings
-    from dvrk_drake.processes.connection import ArmConnection, Dialog, connect
+    from dvrk_drake.processes.connection import ArmConnection, connect
     from dvrk_drake.recordings.reading import read_recording
     from dvrk_drake.recordings.recording import Recording
     from dvrk_drake.recordings.samples import write_samples
@@ -60,8 +61,8 @@ _MODULES = {
     "ArmStation": "systems.arm_station",
     "CollectionSettings": "processes.collector",
     "Contact": "dynamics.contact",
-    "Dialog": "processes.connection",
     "CrtkDriver": "systems.ros.crtk_driver",
+    "Dialog": "processes.arm_session",
     "DvrkDrakeError": "errors",
     "DvrkDriver": "systems.lcm.dvrk_driver",
     "Environment": "models.environment",

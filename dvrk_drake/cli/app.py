@@ -19,6 +19,8 @@ from cyclopts import App, ArgumentCollection, Group, Parameter, Token
 
 if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm as LoadedArm
+    from dvrk_drake.processes.arm_session import Dialog
+    from dvrk_drake.processes.connection import ArmConnection
     from dvrk_drake.progress import Progress
     from dvrk_drake.recordings.recording import Recording as ReadRecording
 
@@ -183,46 +185,21 @@ Realtime = Annotated[
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
-class LcmArm:
-    """Options of all commands for an arm over LCM."""
+class ConnectedArm:
+    """Options of all commands for an arm over LCM or ROS 2."""
 
     arm: Arm
     instrument: Instrument = ""
-    lcm_url: LcmUrl = ""
-    key: Key = None
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "arm", with_instrument(self.arm, self.instrument))
-
-
-@Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
-class ControlledArm(LcmArm):
-    """Options of the commands that control an arm."""
-
-    model: Annotated[
-        Model | None, Parameter(help="Model file, written by identify. Default: the nominal model from the SDF.")
-    ] = None
-    realtime: Realtime = False
-    reset: Annotated[
-        bool,
-        Parameter(
-            show_default=False,
-            help="Print and clear a fault of the arm. If the watchdog of the guard holds the arm, resume control.",
-        ),
-    ] = False
-
-
-@Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
-class AnyArm(LcmArm):
-    """Options of the commands for an arm over LCM or ROS 2."""
-
     transport: Annotated[
         Literal["lcm", "ros"], Parameter(help="lcm: messages of dvrk_drake. ros: topics of a dVRK on ROS 2.")
     ] = "lcm"
+    lcm_url: LcmUrl = ""
+    key: Key = None
     topic: RosTopic = None
     domain: RosDomain = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "arm", with_instrument(self.arm, self.instrument))
 
     @property
     def is_ros(self) -> bool:
@@ -243,21 +220,67 @@ class AnyArm(LcmArm):
             values, own = {"lcm_url": self.lcm_url, "key": self.key, **(lcm or {})}, "lcm"
         else:
             values, own = {"topic": self.topic, "domain": self.domain, **(ros or {})}, "ros"
-        given = [
-            f"--{name.replace('_', '-')}"
-            for name, value in values.items()
-            if value is not False and value not in (None, "")
-        ]
-        if given:
+        if given := [f"--{name.replace('_', '-')}" for name, value in values.items() if is_given(value)]:
             from dvrk_drake.errors import DvrkDrakeError
 
             raise DvrkDrakeError(f"{' and '.join(given)}: only with --transport {own}")
 
+    def as_text(self) -> str:
+        """Returns the options that select the arm, for another command line."""
+        names = ("arm", "transport", "lcm_url", "key", "topic", "domain")
+        values = {name: getattr(self, name) for name in names}
+        return options_text(values | {"transport": "ros" if self.is_ros else None})
+
+    def connect(self, dialog: Dialog, **settings: Any) -> ArmConnection:
+        """Returns the connection to the arm. See `dvrk_drake.connect` for `settings`."""
+        from dvrk_drake.models.arm_files import load_arm
+        from dvrk_drake.processes.connection import connect
+
+        connection = connect(
+            load_arm(self.arm),
+            self.transport,
+            lcm_url=self.lcm_url,
+            key=self.key,
+            topic=self.topic,
+            domain=self.domain,
+            dialog=dialog,
+            **settings,
+        )
+        connection.options = self.as_text()
+        return connection
+
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
-class CollectedArm(AnyArm, ControlledArm):
+class ControlledArm(ConnectedArm):
     """Options of the commands that control an arm over LCM or ROS 2."""
+
+    model: Annotated[
+        Model | None, Parameter(help="Model file, written by identify. Default: the nominal model from the SDF.")
+    ] = None
+    realtime: Realtime = False
+    reset: Annotated[
+        bool,
+        Parameter(
+            show_default=False,
+            help="Print and clear a fault of the arm. If the watchdog of the guard holds the arm, resume control.",
+        ),
+    ] = False
+
+
+def is_given(value: object) -> bool:
+    """Returns whether the value of an option differs from that of an absent option: None, "" or False."""
+    return value is not False and value not in (None, "")
+
+
+def options_text(values: Mapping[str, object]) -> str:
+    """Returns options for a command line, by the names of their parameters. Options that are not given are omitted."""
+    words = []
+    for name, value in values.items():
+        if is_given(value):
+            texts = value if isinstance(value, list) else [] if value is True else [f"{value}"]
+            words += [f"--{name.replace('_', '-')}", *map(shlex.quote, texts)]
+    return " ".join(words)
 
 
 _FILE = Group("Options for the file (docs/recordings.md)", sort_key=2)
@@ -337,12 +360,8 @@ class FileOptions:
 
     def as_text(self) -> str:
         """Returns the options for a command line, beginning with a space, or ""."""
-        words = []
-        for name, value in vars(self).items():
-            if value not in (None, False):
-                values = value if isinstance(value, list) else [] if value is True else [f"{value}"]
-                words += [f"--{name.replace('_', '-')}", *map(shlex.quote, values)]
-        return "".join(f" {word}" for word in words)
+        text = options_text(vars(self))
+        return text and f" {text}"
 
 
 def _factors(texts: Sequence[str] | None) -> dict[str, float] | float | None:

@@ -11,9 +11,9 @@ from cyclopts import Parameter
 import dvrk_drake as dvrk
 from dvrk_drake.cli.app import (
     HARDWARE,
+    ConnectedArm,
     EnvironmentFile,
     Gravity,
-    LcmArm,
     Realtime,
     Seconds,
     Seed,
@@ -21,14 +21,14 @@ from dvrk_drake.cli.app import (
     app,
     whole_number,
 )
-from dvrk_drake.cli.support import load_environment, load_key, print_warning, print_written
+from dvrk_drake.cli.support import load_environment, load_key, print_line, print_warning, print_written
 from dvrk_drake.errors import DvrkDrakeError
 
 
 @app.command(group=HARDWARE)
 def calibrate(
     *,
-    connected: LcmArm,
+    connected: ConnectedArm,
     output: Annotated[str, Parameter(metavar="FOLDER")],
     poses: Annotated[int, Parameter(metavar="N", converter=whole_number)] = 40,
     duration: Seconds = 30.0,
@@ -54,6 +54,7 @@ def calibrate(
             resume control.
         yes: Move the arm without a question. Required if there is no terminal.
     """
+    connected.check(lcm={"reset": reset})
     load_key(connected.key)  # rejects an invalid file before the first step
     around = load_environment(table, environment)
     if not yes and (sys.stdin is None or not sys.stdin.isatty()):
@@ -66,14 +67,20 @@ def calibrate(
         seed=seed,
         gravity=gravity,
         environment=around,
+        transport=connected.transport,
         lcm_url=connected.lcm_url,
         key=connected.key,
+        topic=connected.topic,
+        domain=connected.domain,
         realtime=realtime,
         reset=reset,
         confirm=(lambda name: None) if yes else _confirm,
-        report=lambda line: print(line, flush=True),
+        report=print_line,
     )
     print(*result.summary(), sep="\n", flush=True)
+    print_line(
+        f"{result.duration / 60:.1f} min in total, of which the arm was controlled for {result.moving / 60:.1f} min"
+    )
     for file, what in (
         ("report.html", "errors and verdict of the full dynamics"),
         ("holding_report.html", "errors and verdict of its holding torques at other poses"),
@@ -87,15 +94,11 @@ def calibrate(
     if result.is_usable:
         model = result.folder / "model.yaml"
         print(
-            f"Next: dvrk-drake control --arm {connected.arm} --model {model} --friction-model {model} "
-            f"--friction-ratio 0.3\nIn the driver's configuration of the arm: model: {model.resolve()}"
+            f"In the driver's configuration of the arm: model: {model.resolve()}\n"
+            f"Next: dvrk-drake control {connected.as_text()} --model {model} --friction-ratio 0.3"
         )
     else:
         print_warning("a joint failed the validation; look at the reports before you use the models")
-    print(
-        f"{result.duration / 60:.1f} min in total, of which the arm was controlled for {result.moving / 60:.1f} min",
-        flush=True,
-    )
 
 
 def _confirm(name: str) -> None:

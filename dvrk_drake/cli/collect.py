@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from dvrk_drake.cli.app import HARDWARE, AnyArm, CollectedArm, ControlledArm, Seconds, app, collect, one_of
-from dvrk_drake.cli.lcm import connect_arm
+from dvrk_drake.cli.app import HARDWARE, ConnectedArm, ControlledArm, Seconds, app, collect, one_of
+from dvrk_drake.cli.control import connect_arm
 from dvrk_drake.cli.support import (
     check_output,
     interrupt_ends_process,
@@ -30,7 +30,7 @@ def record(
     file: Annotated[str, Parameter(metavar="FILE")],
     /,
     *,
-    connected: AnyArm,
+    connected: ConnectedArm,
     duration: Annotated[Seconds | None, Parameter(metavar="S")] = None,
 ) -> None:
     """Record the measurements of an arm over LCM or ROS 2.
@@ -41,22 +41,13 @@ def record(
         file: New file: .mcap for a bag for ROS 2 tools, Foxglove and Rerun. With LCM also .csv, or .log for an LCM log.
         duration: Duration [s], counted from the first message. Default: until Ctrl-C.
     """
-    from dvrk_drake.models.arm_files import load_arm
-    from dvrk_drake.processes.connection import Dialog, connect
+    from dvrk_drake.processes.arm_session import Dialog
     from dvrk_drake.processes.live_status import LiveLine
     from dvrk_drake.processes.simulated_arm import stop_on_signals
 
     connected.check()
     stopped, line = stop_on_signals(), LiveLine(sys.stderr)
-    connection = connect(
-        load_arm(connected.arm),
-        connected.transport,
-        lcm_url=connected.lcm_url,
-        key=connected.key,
-        topic=connected.topic,
-        domain=connected.domain,
-        dialog=Dialog(stopped, report=line.report, show=line.show),
-    )
+    connection = connected.connect(Dialog(stopped, report=line.report, show=line.show))
     try:
         notes = connection.record(file, float("inf") if duration is None else duration)
     finally:
@@ -69,7 +60,7 @@ def teach(
     poses: Annotated[str, Parameter(metavar="POSES.yaml")],
     /,
     *,
-    controlled: CollectedArm,
+    controlled: ControlledArm,
     at_rest: Annotated[bool, Parameter(show_default=False)] = False,
 ) -> None:
     """Add poses to a pose file while you move the arm by hand.
@@ -81,7 +72,7 @@ def teach(
         poses: Pose file to write. The poses of an existing file are kept.
         at_rest: Also add each pose at which the arm is at rest for one second.
     """
-    _check_transport(controlled)
+    controlled.check(lcm={"reset": controlled.reset})
     check_output(poses, overwrite=True)
     with interrupt_ends_process():
         connection, line = _connect(controlled, keys=True)
@@ -100,7 +91,7 @@ def collect_poses(
     poses: Annotated[str, Parameter(metavar="POSES.yaml")],
     /,
     *,
-    controlled: CollectedArm,
+    controlled: ControlledArm,
     output: Annotated[str, Parameter(metavar="FILE.csv")],
     both_sides: Annotated[bool, Parameter(negative="--no-both-sides")] = True,
     traverse_time: Seconds = 5.0,
@@ -158,7 +149,7 @@ def collect_motion(
     motion: Annotated[str, Parameter(metavar="MOTION.yaml")],
     /,
     *,
-    controlled: CollectedArm,
+    controlled: ControlledArm,
     output: Annotated[str | None, Parameter(metavar="FILE.csv", group=_TASK)] = None,
     rehearse: Annotated[bool, Parameter(show_default=False, group=_TASK)] = False,
 ) -> None:
@@ -172,7 +163,7 @@ def collect_motion(
         output: CSV file for the measurements.
         rehearse: Follow one period of the motion at a fifth of its speed. Required once before the first recording.
     """
-    _check_transport(controlled)
+    controlled.check(lcm={"reset": controlled.reset})
     check_output(motion, overwrite=True)
     if output is not None:
         check_output(output, motion, controlled.model or "", overwrite=True)
@@ -201,11 +192,6 @@ def collect_motion(
         print(f"Next: dvrk-drake identify {files} --arm {controlled.arm} --output model.yaml", flush=True)
 
 
-def _check_transport(controlled: CollectedArm) -> None:
-    """Rejects options of the other transport for a command in which this process controls the arm."""
-    controlled.check(lcm={"reset": controlled.reset})
-
-
 def _connect(controlled: ControlledArm, *, keys: bool, confirms: bool = False) -> tuple[ArmConnection, LiveLine]:
     """Returns the connection to the arm, with a dialog on the terminal, and its status line.
 
@@ -214,7 +200,7 @@ def _connect(controlled: ControlledArm, *, keys: bool, confirms: bool = False) -
         keys: Whether the Enter key has an effect.
         confirms: Whether the operator must confirm the first motion, if there is a terminal.
     """
-    from dvrk_drake.processes.connection import Dialog
+    from dvrk_drake.processes.arm_session import Dialog
     from dvrk_drake.processes.live_status import LiveLine
     from dvrk_drake.processes.teacher import EnterKey
 

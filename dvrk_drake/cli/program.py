@@ -24,16 +24,16 @@ from cyclopts import (
 )
 
 from dvrk_drake.cli import (
+    bridge,
     calibrate,
     collect,
+    control,
     demo,
     excite,
     export,
     identify,
-    lcm,
     model,
     recordings,
-    ros,
     simulate,
     simulated_arm,
 )
@@ -46,7 +46,20 @@ from dvrk_drake.errors import DvrkDrakeError
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 #: Importing these modules adds their commands to the application.
-COMMANDS = model, recordings, identify, excite, export, simulate, demo, simulated_arm, lcm, ros, collect, calibrate
+COMMANDS = (
+    model,
+    recordings,
+    identify,
+    excite,
+    export,
+    simulate,
+    demo,
+    simulated_arm,
+    control,
+    bridge,
+    collect,
+    calibrate,
+)
 
 #: Mapping from required options to the accepted values, for the message of a missing option.
 REQUIRED = {

@@ -7,11 +7,12 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from dvrk_drake.cli.app import HARDWARE, AnyArm, Gravity, Model, Realtime, app
+from dvrk_drake.cli.app import HARDWARE, ConnectedArm, Gravity, Model, Realtime, app
 from dvrk_drake.cli.support import (
     driver_configuration,
     interrupt_ends_process,
     mounted,
+    print_line,
     request_realtime,
 )
 
@@ -19,7 +20,7 @@ from dvrk_drake.cli.support import (
 @app.command(group=HARDWARE)
 def sim_arm(
     *,
-    connected: AnyArm,
+    connected: ConnectedArm,
     pose: Annotated[list[float] | None, Parameter(metavar="Q ..", consume_multiple=True)] = None,
     gravity: Gravity = None,
     effects: Annotated[list[str] | None, Parameter(metavar="NAME ..", consume_multiple=True)] = None,
@@ -65,7 +66,7 @@ def sim_arm(
         request_realtime(realtime)  # the threads of DDS inherit it
     else:
         configuration = driver_configuration(driver, connected.key, connected.lcm_url)
-    print(f"starting the simulated {arm.name}", flush=True)
+    print_line(f"starting the simulated {arm.name}")
     with interrupt_ends_process():
         if connected.is_ros:
             simulated = SimulatedRosArm(arm, topics, start, simulated_effects, enabled=enabled)
@@ -76,6 +77,6 @@ def sim_arm(
         settle_memory()
         if not connected.is_ros:
             request_realtime(realtime)
-        print(f"simulated {arm.name} on {simulated.source}; press Ctrl-C to end", flush=True)
-        pace = simulated.run(stopped, lambda line: print(line, flush=True), EnterKey.of_terminal())
-    print(f"ended; {pace.describe()}", flush=True)
+        print_line(f"simulated {arm.name} on {simulated.source}; press Ctrl-C to end")
+        pace = simulated.run(stopped, print_line, EnterKey.of_terminal())
+    print_line(f"ended; {pace.describe()}")

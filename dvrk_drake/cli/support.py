@@ -172,6 +172,11 @@ def print_written(path: str | Path, what: str = "") -> None:
     print(f"wrote {path}{what and ': '}{what}", flush=True)
 
 
+def print_line(line: str) -> None:
+    """Prints a line at once, also into a pipe."""
+    print(line, flush=True)
+
+
 @contextmanager
 def folders_only_for_results() -> Iterator[None]:
     """Context manager that, after an error or Ctrl-C, removes the empty folders that were created in the block."""

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
+from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import describe_refusal, describe_state
 from dvrk_drake.processes.control import FIRST_WAIT, SILENCE
 from dvrk_drake.systems.lcm.arm_link import ArmLink
@@ -26,74 +28,125 @@ _STOP = 1.0
 _POWER_OFF = _SENDER_RESERVED + _STOP
 
 
+#: Bits of `joint_flags` and what they mean.
+_FLAGS = {
+    lcmt_dvrk_status.FLAG_EFFORT_CLAMPED: "effort limit",
+    lcmt_dvrk_status.FLAG_RATE_LIMITED: "rate limit",
+    lcmt_dvrk_status.FLAG_POSITION_LIMIT: "soft wall",
+    lcmt_dvrk_status.FLAG_COUPLED_LIMIT: "coupled limit",
+    lcmt_dvrk_status.FLAG_SPEED_LIMIT: "speed limit",
+    lcmt_dvrk_status.FLAG_IMPLAUSIBLE: "position not plausible",
+}
+
+
 @dataclass(frozen=True)
 class ArmObservation:
-    """Statuses of an arm during a short time.
+    """State of an arm with n joints during a short time, for its operator.
 
     Attributes:
-        first, last: First and last status.
-        count: Number of received statuses after the first.
-        lost: Number of statuses that were not received.
-        seconds: Time between both statuses on the clock of this process [s].
+        state: State of the guard over LCM, or operating state over ROS 2.
+        why: Reason why the arm is in its state.
+        next_step: What the operator can do next, or "" if nothing is to be done.
+        is_fault: Whether the arm has a fault.
+        notes: Sentences on the messages: their rate and age, and what is not known.
+        q: Mean positions (n,) [rad, m]. NaN if a measurement is not valid.
+        v: Mean velocities (n,) [rad/s, m/s].
+        effort: Mean efforts of the motors (n,) [N m, N].
+        count: Number of averaged measurements.
+        flags: Active limits of each joint (n), "" if there are none.
+
+    Example:
+        >>> import dvrk_drake as dvrk
+        >>> connection = dvrk.connect(dvrk.load_arm("mtml"))
+        >>> connection.measure().why  # doctest: +SKIP
+        'no controller sends commands'
     """
 
-    first: lcmt_dvrk_status
-    last: lcmt_dvrk_status
+    state: str
+    why: str
+    next_step: str
+    is_fault: bool
+    notes: Sequence[str]
+    q: NDArray[np.float64]
+    v: NDArray[np.float64]
+    effort: NDArray[np.float64]
     count: int
-    lost: int
-    seconds: float
-
-    @property
-    def commands(self) -> int:
-        """Number of commands that the arm accepted."""
-        return int(self.last.num_accepted - self.first.num_accepted)
-
-    def explanation(self) -> tuple[str, str]:
-        """Returns why the arm is in its state, and what the operator can do next ("" if nothing is to be done)."""
-        first, last = self.first, self.last
-        arm = f"--arm {last.arm_name.lower()}"
-        reset = f"look at the arm, remove the cause, then: dvrk-drake control {arm} --reset"
-        if last.utime == first.utime and first.utime:
-            why = f"no new measurement arrives ({last.fault_text or 'no fault'})"
-            return why, f"check the process of the arm and its connection. Then {reset}"
-        if last.fault_code != lcmt_dvrk_status.FAULT_NONE:
-            return f"fault: {last.fault_text}", reset
-        if last.guard_state == lcmt_dvrk_status.STATE_OFF:
-            return "the motors have no power", "switch the power on, as the manual of the arm describes"
-        if last.fault_text:
-            return f"the guard holds the arm until an operator resumes: {last.fault_text}", reset
-        if last.gravity_compensation:
-            why = "the arm adds its own gravity compensation, so controllers of this package do not start"
-            return why, "switch off gravity_compensation in the arm's driver"
-        if not np.all(np.isfinite([*last.position, *last.velocity, *last.effort_measured])):
-            return "a measured position, velocity or effort is not finite", "check the sensors of the arm"
-        if last.num_refused > first.num_refused:
-            return f"commands are refused: {describe_refusal(last.refusal_code)}", "correct or end the controller"
-        if last.num_ignored > first.num_ignored:
-            return (
-                f"messages are ignored: {describe_refusal(last.ignored_code)}",
-                "give the arm's key to the controller",
-            )
-        if not self.commands:
-            return "no controller sends commands", f"dvrk-drake control {arm}"
-        return f"sender {last.command_sender_id} sends {self.commands / self.seconds:.0f} commands per second", ""
+    flags: Sequence[str]
 
 
-def observe(link: ArmLink, seconds: float = 0.5) -> ArmObservation:
+def observe(link: ArmLink, seconds: float, options: str) -> ArmObservation:
     """Receives the statuses of an arm for some time.
 
     Args:
         link: Channels of the arm.
         seconds: Duration [s].
+        options: Options of a command line for this arm, for the next step.
 
     Raises:
         ControllerError: No status arrives.
     """
-    first = last = link.next_status(FIRST_WAIT)
-    lost, count, start = link.lost, 0, link.now()
-    while link.now() < start + seconds:
-        last, count = link.next_status(SILENCE), count + 1
-    return ArmObservation(first, last, count, link.lost - lost, link.now() - start)
+    statuses, lost, start = [link.next_status(FIRST_WAIT)], link.lost, link.now()
+    while (duration := link.now() - start) < seconds:
+        statuses.append(link.next_status(SILENCE))
+    first, last = statuses[0], statuses[-1]
+    q, v, effort = np.mean([[s.position, s.velocity, s.effort_measured] for s in statuses], axis=0)
+    rate = (len(statuses) - 1) / max(duration, seconds)
+    commands = (last.num_accepted - first.num_accepted) / max(duration, seconds)
+    why, next_step = _explain(link.arm, first, last, commands, options)
+    notes = [
+        f"Statuses: {rate:.0f} per second, {link.lost - lost} lost.",
+        f"Commands since the start of the arm: {last.num_accepted} accepted, {last.num_lost} lost, {last.num_refused} "
+        f"refused, {last.num_ignored} ignored, {last.num_expired} expired.",
+    ]
+    if last.weaker_settings:
+        notes.append(f"Guard settings weaker than the defaults: {last.weaker_settings}.")
+    is_fault = last.fault_code != lcmt_dvrk_status.FAULT_NONE
+    flags = [", ".join(text for bit, text in _FLAGS.items() if flag & bit) for flag in last.joint_flags]
+    state = describe_state(last.guard_state)
+    return ArmObservation(state, why, next_step, is_fault, notes, q, v, effort, len(statuses), flags)
+
+
+def _explain(
+    arm: Arm, first: lcmt_dvrk_status, last: lcmt_dvrk_status, commands: float, options: str
+) -> tuple[str, str]:
+    """Returns why the arm is in its state, and what the operator can do next. `commands` is their rate [Hz]."""
+    reset = f"look at the arm, remove the cause, then: dvrk-drake control {options} --reset"
+    if last.utime == first.utime and first.utime:
+        why = f"no new measurement arrives ({last.fault_text or 'no fault'})"
+        return why, f"check the process of the arm and its connection. Then {reset}"
+    if last.fault_code != lcmt_dvrk_status.FAULT_NONE:
+        return f"fault: {last.fault_text}", reset
+    if last.guard_state == lcmt_dvrk_status.STATE_OFF:
+        return "the motors have no power", "switch the power on, as the manual of the arm describes"
+    if last.fault_text:
+        return f"the guard holds the arm until an operator resumes: {last.fault_text}", reset
+    if last.gravity_compensation:
+        why = "the arm adds its own gravity compensation, so controllers of this package do not start"
+        return why, "switch off gravity_compensation in the arm's driver"
+    if not np.all(np.isfinite([*last.position, *last.velocity, *last.effort_measured])):
+        return "a measured position, velocity or effort is not finite", "check the sensors of the arm"
+    if last.num_refused > first.num_refused:
+        return f"commands are refused: {describe_refusal(last.refusal_code)}", "correct or end the controller"
+    if last.num_ignored > first.num_ignored:
+        return f"messages are ignored: {describe_refusal(last.ignored_code)}", "give the arm's key to the controller"
+    if commands:
+        return f"sender {last.command_sender_id} sends {commands:.0f} commands per second", ""
+    return idle_reason(arm, last.position, "no controller sends commands", options)
+
+
+def idle_reason(arm: Arm, q: Sequence[float], why: str, options: str) -> tuple[str, str]:
+    """Returns why an arm at `q` (n,) does not move without commands, and what the operator can do next.
+
+    Args:
+        arm: Arm with n joints.
+        q: Measured positions (n,) [rad, m].
+        why: Reason if the arm is inside its limits.
+        options: Options of a command line for this arm.
+    """
+    if violations := "; ".join(arm.limit_violations(q)):
+        why = f"the arm is outside its limits, so controllers do not start: {violations}"
+        return why, "move the arm inside its limits, or check its encoder offsets"
+    return why, f"dvrk-drake control {options}"
 
 
 def stop_arm(link: ArmLink, *, power_off: bool = False) -> lcmt_dvrk_status:

@@ -1,4 +1,15 @@
-"""Calibrates a connected arm: a sequence of commands, each with named files in one folder."""
+"""Calibrates a connected arm: a sequence of commands, each with named files in one folder.
+
+Each step is a command in a process of its own, and not a call of `ArmConnection` in this process, for these reasons:
+
+- Real-time scheduling, locked memory and cores that stay awake end with the motion. In one process, a design or an
+  identification of minutes would keep them, and could delay the process of the arm on the same computer.
+- Ctrl-C ends a design at once. An exception can be lost there, because extension modules call Python code.
+- Reports are written by commands, and this package must not import the reports.
+
+A signal to this process is passed on to the command, and the end of this process ends the command. In both cases, the
+arm holds its pose.
+"""
 
 # This file has no postponed annotations, because load_typed_yaml reads the types at run time.
 import ctypes
@@ -10,6 +21,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import yaml
 
@@ -129,14 +141,17 @@ def calibrate(
     seed: int = 0,
     gravity: Sequence[float] | None = None,
     environment: Environment | None = None,
+    transport: Literal["lcm", "ros"] = "lcm",
     lcm_url: str = "",
     key: str | None = None,
+    topic: str | None = None,
+    domain: int | None = None,
     realtime: bool = False,
     reset: bool = False,
     confirm: Callable[[str], None],
     report: Callable[[str], None] = print,
 ) -> Calibration:
-    """Calibrates an arm over LCM: designs, collects, identifies, validates and exports, and continues earlier work.
+    """Calibrates an arm: designs, collects, identifies, validates and exports, and continues earlier work.
 
     Each step is a command of dvrk-drake in a process of its own, in the folder. Complete steps are not repeated. A
     signal ends the running command first, and the arm holds its pose.
@@ -149,10 +164,10 @@ def calibrate(
         seed: Seed of the designs, 0 or larger.
         gravity: Gravity vector in the base frame [m/s^2]. None: the vector in the arm file.
         environment: Fixed objects around the arm. None: there are none.
-        lcm_url: URL of the LCM network. "": LCM's default.
-        key: File with the key that signs messages. None: messages are not signed.
-        realtime: Whether to request real-time scheduling.
-        reset: Whether to clear a fault of the arm before its first motion, and to resume after a watchdog hold.
+        transport: "lcm" for the messages of this package, "ros" for the topics of a dVRK on ROS 2.
+        lcm_url, key, topic, domain: See `connect`.
+        realtime: Whether to request real-time scheduling while this computer controls the arm.
+        reset: Whether to clear a fault over LCM before the first motion, and to resume after a watchdog hold.
         confirm: Function that is called with the name of the arm before each motion. It returns if the arm may move.
         report: Function that is called with each line of text.
 
@@ -179,7 +194,9 @@ def calibrate(
     loaded = prepare_folder(folder, settings)
     connection = [f"--lcm-url={lcm_url}"] if lcm_url else []
     connection += ["--key", _absolute(key)] if key else []
-    connection += ["--realtime"] if realtime else []
+    connection += ["--transport", "ros"] if transport == "ros" else []
+    connection += [f"--topic={topic}"] if topic else []
+    connection += [] if domain is None else [f"--domain={domain}"]
     count = len(calibration_steps(folder, settings, loaded))
     for number in range(count):
         # The commands depend on the files of the earlier steps.
@@ -190,7 +207,11 @@ def calibrate(
             continue
         words = list(step.words)
         if step.moves:
-            words += connection + (["--reset"] if reset else [])
+            words += connection
+            if transport == "ros" and "poses" in words:
+                words += ["--yes"]  # the dVRK moves the arm, after the question of this calibration
+            else:
+                words += ["--realtime"] * realtime + ["--reset"] * reset
             reset = False
         report(f"{header}: dvrk-drake {shlex.join(words)}")
         if step.moves:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator
 from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.excitation.pose_file import CollectionFile
+from dvrk_drake.analysis.excitation.pose_file import CollectionFile, load_poses, pose_environment
+from dvrk_drake.dynamics.identified_model import ControlModel
 from dvrk_drake.errors import CollectionError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.approach import offset_pose
@@ -17,7 +20,12 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.ranges import number_fault, within
 from dvrk_drake.processes.arm_controller import ArmController, GoalController, MotionStyle
 from dvrk_drake.processes.arm_mover import REST_TIME, SETTLE, ArmMover, Steps
+from dvrk_drake.processes.arm_session import ArmSession
+from dvrk_drake.processes.control import SILENCE
+from dvrk_drake.processes.ros_recorder import RosRecorder, bag_path
 from dvrk_drake.systems.cubic_trajectory import CubicTrajectory
+from dvrk_drake.systems.lcm.arm_link import ArmLink
+from dvrk_drake.systems.ros.open_domain import open_ros_domain
 
 #: Time over which measurements are averaged [s].
 MEASURE = 0.25
@@ -249,3 +257,67 @@ def _motions(
     if begin is None:
         return [(pose, REST_TIME, 1.0)]
     return [(begin, style.approach_rest, 1.0), (pose, REST_TIME, style.approach_speed)]
+
+
+def collect_poses(
+    session: ArmSession, poses: str | Path, output: str | Path, settings: CollectionSettings
+) -> Collector | None:
+    """Moves an arm to poses and measures its efforts; see `ArmConnection.collect_poses`."""
+    arm, dialog = session.arm, session.dialog
+    checked, file = load_poses(poses, arm), CollectionFile(output, arm, settings.both_sides)
+    remaining = checked[~file.finished(checked)]
+    if not len(remaining):
+        dialog.report(f"{output}: contains all {len(checked)} poses already")
+        return None
+    dialog.report(f"{len(remaining)} poses of {arm.name} remain; a later call continues after an interruption")
+    controller: ArmController | GoalController
+    link: ArmLink
+    bag: RosRecorder | None = None
+    if session.transport == "lcm":
+        controller, link = session.start("hold")
+        (first, *_) = approaches(arm, remaining[0], settings, controller.style)
+        _, link = session.check_path(link, remaining[0] if first is None else first, pose_environment(poses))
+    else:
+        started = _start_goals(session, output, remaining, settings)
+        if started is None:
+            return None
+        controller, link, bag = started
+    collector = Collector(
+        checked, controller, file, settings, stopped=dialog.stopped, enter=dialog.enter, report=dialog.report
+    )
+
+    def on_status(status: lcmt_dvrk_status, time: float) -> NDArray[np.float64] | None:
+        if bag is not None:
+            bag.update()
+        return collector.update(status, time)
+
+    with closing(bag) if bag is not None else nullcontext(), closing(collector):
+        session.control(link, controller, lambda: collector.finished, collector.describe, on_status)
+    if bag is not None:
+        for line in (f"{bag.num_rows} messages; hold was published", *bag.notes()):
+            dialog.report(f"{bag.path}: {line}")
+    return collector
+
+
+def _start_goals(
+    session: ArmSession, output: str | Path, remaining: NDArray[np.float64], settings: CollectionSettings
+) -> tuple[GoalController, ArmLink, RosRecorder] | None:
+    """Connects to an arm that the dVRK moves, and starts a bag. Returns None if the operator stopped the command."""
+    from dvrk_drake.systems.ros.crtk_move_link import connect_move_link
+
+    session.ready()
+    arm, dialog, model = session.arm, session.dialog, ControlModel(session.model)
+    with ExitStack() as after_error:
+        ros = after_error.enter_context(closing(open_ros_domain(session.domain)))
+        link = connect_move_link(
+            ros, arm, model, session.topic, settings.max_effort, report=dialog.report, stopped=dialog.stopped
+        )
+        for line in summary(arm, np.array(link.next_status(SILENCE).position), remaining, settings):
+            dialog.report(line)
+        dialog.confirm()
+        if dialog.stopped():
+            return None
+        bag = RosRecorder(arm, bag_path(output), link.where, ros)
+        bag.subscribe(dialog.stopped)
+        after_error.pop_all()
+    return GoalController(arm, lambda: link.is_busy), link, bag

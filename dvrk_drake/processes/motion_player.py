@@ -4,15 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, wait
+from contextlib import closing
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dvrk_drake.analysis.excitation.motion_limits import execution_limits, motion_violations
 from dvrk_drake.analysis.excitation.periodic_motion import PeriodicMotion
 from dvrk_drake.errors import CollectionError, DvrkDrakeError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
+from dvrk_drake.processes import motion_parts
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.arm_mover import MAX_TRACKING_ERROR, SETTLE, ArmMover, Steps, TrackingError
+from dvrk_drake.processes.arm_session import ArmSession
 from dvrk_drake.processes.motion_parts import MotionPartFile
 
 #: Speed of a rehearsal, relative to the motion.
@@ -30,6 +37,26 @@ MAX_PAUSE = 60.0
 _REMOVED = 3.0
 #: Number of rows that are written at once.
 _BLOCK = 100
+
+
+@dataclass(frozen=True)
+class PlayedMotion:
+    """Result of a motion.
+
+    Attributes:
+        begin, end: Time of the motion at which it began and ended [s].
+        duration: Duration of the motion [s].
+        path: File with the measurements, or with the rehearsal. None: nothing was written.
+        tracking_error: Largest tracking error as a fraction of the range of a joint.
+        is_complete: Whether the motion ended at its end.
+    """
+
+    begin: float
+    end: float
+    duration: float
+    path: Path | None
+    tracking_error: float
+    is_complete: bool
 
 
 class MotionPlayer(ArmMover):
@@ -190,3 +217,55 @@ class MotionPlayer(ArmMover):
         if self._rows and self._output is not None:
             rows, self._rows = self._rows, []
             self._writing = self._writer.submit(self._output.append, rows)
+
+
+def play_motion(session: ArmSession, path: str | Path, output: str | Path | None) -> PlayedMotion:
+    """Moves an arm along a motion, and records it; see `ArmConnection.play`."""
+    arm, dialog = session.arm, session.dialog
+    motion = PeriodicMotion.load(path, arm)
+    begin, end, part, create = 0.0, motion.period, None, None
+    if output is not None:
+        parts = motion_parts.recorded_parts(output, arm, motion)
+        rest, end = motion_parts.begin_of_rest(parts, motion.duration), motion.duration
+        if rest is None:
+            return PlayedMotion(end, end, end, None, 0.0, True)
+        if not motion_parts.is_rehearsed(path, arm, motion):
+            raise CollectionError(
+                f"{path}: the motion was not rehearsed on {arm.name}. First run: dvrk-drake collect motion "
+                f"{path} {session.options} --rehearse"
+            )
+        begin, part = rest, motion_parts.next_part(output, parts)
+        create = partial(MotionPartFile, part, arm, motion)
+    # The limits of the arm and of its guard are checked independently of those of the design.
+    if violations := motion_violations(motion, arm, execution_limits(motion.environment), session.model):
+        raise CollectionError(f"{path}: {violations[0]}; design a motion within the limits of {arm.name}")
+    controller, link = session.start("hold")
+    q, link = session.check_path(link, motion.evaluate([begin]).q[0], motion.environment)
+    speed = REHEARSAL_SPEED if output is None else 1.0
+    player = MotionPlayer(
+        motion,
+        controller,
+        q,
+        output=create,
+        begin=begin,
+        end=end,
+        speed=speed,
+        stopped=dialog.stopped,
+        enter=dialog.enter or (lambda: False),
+        report=dialog.report,
+    )
+    what = f"rehearsal of {path} at {100 * speed:.0f} % speed" if output is None else str(path)
+    seconds = (end - begin) / speed
+    dialog.report(f"{arm.name} moves to the start and then for {seconds:.0f} s: {what}")
+    with closing(player):
+        session.control(link, controller, lambda: player.finished, player.describe, player.update)
+    if player.problem is not None:
+        raise player.problem
+    span, is_complete = arm.position_upper - arm.position_lower, player.motion_time >= end
+    if output is None and is_complete:
+        errors = player.largest_error.tolist()
+        rehearsal = motion_parts.Rehearsal(arm=arm.name, motion=motion.digest(), speed=speed, tracking_error=errors)
+        part = rehearsal.save(path)
+    written = part if player.motion_time > begin and (is_complete or output is not None) else None
+    largest = float((player.largest_error / span).max())
+    return PlayedMotion(begin, player.motion_time, motion.duration, written, largest, is_complete)

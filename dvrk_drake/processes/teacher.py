@@ -10,6 +10,7 @@ import select
 import sys
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 from typing import IO
 
@@ -20,6 +21,7 @@ from dvrk_drake.analysis.excitation.pose_file import load_poses_if_any, same_pos
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.processes.arm_controller import ArmController
+from dvrk_drake.processes.arm_session import ArmSession
 
 
 class RestDetector:
@@ -132,6 +134,19 @@ class Teacher:
         if violations := arm.limit_violations(q):
             return "; ".join(violations)
         return "" if known is None else f"same as pose {known + 1}"
+
+
+def teach_poses(session: ArmSession, path: str | Path, *, at_rest: bool) -> int:
+    """Adds poses to a pose file while the operator moves the arm; see `ArmConnection.teach`."""
+    load_poses_if_any(path, session.arm)  # rejects an invalid file before the arm is connected
+    controller, link = session.start("gravity")
+    dialog = session.dialog
+    enter = dialog.enter or (lambda: False)
+    teacher = Teacher(controller, path, at_rest=at_rest, requested=enter, report=dialog.report)
+    dialog.report(f"{session.arm.name} compensates gravity; move the arm by hand")
+    with closing(teacher):
+        session.control(link, controller, dialog.stopped, lambda: f"{len(teacher.poses)} poses", teacher.update)
+    return len(teacher.poses)
 
 
 class EnterKey:

@@ -7,7 +7,6 @@ import json
 import os
 import subprocess
 import sys
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -36,7 +35,8 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel, ValidationSumm
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import ArmEffects, DriveEffect
-from dvrk_drake.processes.connection import Dialog, model_warning
+from dvrk_drake.processes.arm_session import Dialog
+from dvrk_drake.processes.connection import model_warning
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.recordings.writing import write_recording
@@ -267,14 +267,14 @@ def test_saved_verdicts_include_all_joints(truth, tmp_path):
 
 def test_commands_warn_before_connecting_to_the_arm(files, capsys):
     """`connect_arm` is shared by control and collect. It does not open the network."""
-    from dvrk_drake.cli import lcm
+    from dvrk_drake.cli.app import ControlledArm
+    from dvrk_drake.cli.control import connect_arm
 
     model, _, bad = files
     assert main(["validate", bad, "--model", model, "--save"]) == 0
     capsys.readouterr()
     for path, warnings in ((model, 1), (None, 0)):
-        options = SimpleNamespace(arm="mtmr", model=path, lcm_url="", realtime=False, key=None, reset=False)
-        assert lcm.connect_arm(options, Dialog()).arm.name == "MTMR"
+        assert connect_arm(ControlledArm(arm="mtmr", model=path), Dialog()).arm.name == "MTMR"
         assert capsys.readouterr().err.count("shoulder_pitch (do not use)") == warnings
 
 

@@ -37,9 +37,9 @@ def simulated(monkeypatch):
             sticky.off = sticky.ticks == what.off_at
             sticky.step(controller.answer(status, time, on_status(status, time)))
 
-    monkeypatch.setattr("dvrk_drake.processes.connection.ArmConnection._start", start)
-    monkeypatch.setattr("dvrk_drake.processes.connection.ArmConnection._lcm_link", lambda *_: opened)
-    monkeypatch.setattr("dvrk_drake.processes.connection.control", control)
+    monkeypatch.setattr("dvrk_drake.processes.arm_session.ArmSession.start", start)
+    monkeypatch.setattr("dvrk_drake.processes.arm_session.ArmSession.open_lcm_link", lambda *_: opened)
+    monkeypatch.setattr("dvrk_drake.processes.arm_session.control", control)
     monkeypatch.setattr(
         "dvrk_drake.processes.simulated_arm.stop_on_signals", lambda: lambda: what.stopped(what.arms[-1])
     )

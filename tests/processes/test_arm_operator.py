@@ -1,7 +1,5 @@
 """State of an arm for its operator, stop and reset, with a simulated clock and without a network."""
 
-from contextlib import nullcontext
-
 import pytest
 from guard_bench import ARM
 from guarded_arm import GuardedArm
@@ -98,6 +96,10 @@ def silent(link):
     link.next_status = repeated
 
 
+def outside(link):
+    link.status.position = [0.1 + ARM.position_upper[0], *link.status.position[1:]]
+
+
 def refused(link):
     wrong = Command()
     wrong.arm_name, wrong.num_joints, wrong.session_id = ARM.name, ARM.num_joints, link.guard.session_id
@@ -118,6 +120,7 @@ def ignored(link):
         (watchdog_hold, "until an operator resumes: its period is 20 ms.", "dvrk-drake control --arm mtml --reset"),
         (own_gravity, "the arm adds its own gravity compensation", "switch off gravity_compensation"),
         (lambda link: None, "MTML: hold, no controller sends commands.", "dvrk-drake control --arm mtml"),
+        (outside, "MTML: hold, the arm is outside its limits, so controllers do not start: outer_yaw", "move the arm"),
         (silent, "MTML: hold, no new measurement arrives", "check the process of the arm and its connection."),
         (refused, "MTML: hold, commands are refused: ", "correct or end the controller"),
         (ignored, "MTML: hold, messages are ignored: ", "give the arm's key to the controller"),
@@ -126,18 +129,17 @@ def ignored(link):
 def test_status_explains_an_arm_that_does_not_move(prepare, why, next_step):
     link = GuardedArm(ALL_MODES)
     prepare(link)
-    text = " ".join(printed(status_page(ARM, observe(link))).split())
+    text = " ".join(printed(status_page(ARM, observe(link, 0.5, "--arm mtml"))).split())
     assert why in text and f"Next: {next_step}" in text.replace("look at the arm, remove the cause, then: ", "")
 
 
 def test_status_shows_controller_and_limits(controlled):
     link, control = controlled
     link.before_step = lambda: None
-    first = observe(link, 0.001).last
     for _ in range(100):
         control()
-    seen = observe(link, 0.001)
-    assert seen.last.num_accepted == first.num_accepted + 100
+    seen = observe(link, 0.001, "")
+    assert f"{link.guard.counts.accepted} accepted" in seen.notes[1]
     text = printed(status_page(ARM, seen))
     assert all(name in text for name in ARM.joint_names) and " 5 %" in text
 
@@ -184,7 +186,7 @@ def test_arm_that_does_not_stop_is_an_error():
 
 def test_commands_of_the_operator(monkeypatch, capsys):
     link = GuardedArm(ALL_MODES)
-    monkeypatch.setattr("dvrk_drake.cli.lcm._operator_link", lambda *_: nullcontext(link))
+    monkeypatch.setattr("dvrk_drake.processes.arm_session.ArmSession.open_lcm_link", lambda _: link)
     for command, code, text in (
         (["status"], 0, "MTML: hold, no controller sends commands."),
         (["stop", "--power-off"], 0, "MTML is stopped: off"),

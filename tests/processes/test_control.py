@@ -208,8 +208,8 @@ def test_run_prints_each_change_once(controller, monkeypatch, capsys):
             report(LiveStatus(state, pace, problem))
 
     link = SimpleNamespace(close=lambda: None)
-    monkeypatch.setattr("dvrk_drake.processes.connection.ArmConnection._start", lambda *_: (controller, link))
-    monkeypatch.setattr("dvrk_drake.processes.connection.control", control)
+    monkeypatch.setattr("dvrk_drake.processes.arm_session.ArmSession.start", lambda *_: (controller, link))
+    monkeypatch.setattr("dvrk_drake.processes.arm_session.control", control)
     monkeypatch.setattr("dvrk_drake.processes.simulated_arm.stop_on_signals", lambda: None)
     assert main(["control", "--arm", "mtml", "--reset"]) == 0
     output = capsys.readouterr()

@@ -34,6 +34,9 @@ class GuardedArm:
     def release(self):
         return False
 
+    def close(self):
+        pass
+
     def send(self, command):
         self.commands.append(command)
         self.guard.receive(command, self.utime)

@@ -26,7 +26,7 @@ from dvrk_drake.systems.ros.open_domain import open_ros_domain
 #: Lowest rate of measured_js for POSITION and EFFORT [Hz].
 MIN_RATE = 500.0
 #: Accepted error of the measured rate, as a fraction.
-_RATE_TOLERANCE = 0.05
+RATE_TOLERANCE = 0.05
 #: Number of measurements between two checks of their rate. Number of successful checks after an insufficient rate.
 _RATE_INTERVAL, _GOOD_RATES = 20, 5
 #: Time without a measurement after which the guard is stepped nevertheless [us].
@@ -341,7 +341,7 @@ class CrtkBridge:
         rate, topic = self._clock.rate, f"{self._client.namespace}/measured_js"
         if rate is None:
             return f"the rate of {topic} is not known yet"
-        if rate >= (1.0 - _RATE_TOLERANCE) * MIN_RATE:
+        if rate >= (1.0 - RATE_TOLERANCE) * MIN_RATE:
             self._good_rates += 1
             was_low = "arrives at" in self._rate_problem
             return self._rate_problem if was_low and self._good_rates < _GOOD_RATES else ""

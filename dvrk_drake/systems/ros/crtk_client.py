@@ -1,4 +1,4 @@
-"""Client for the ROS 2 topics of one dVRK arm.
+"""Observer and client for the ROS 2 topics of one dVRK arm.
 
 The topic names are those of CRTK (Collaborative Robotics Toolkit, https://crtk-robotics.readthedocs.io).
 """
@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dvrk_drake.errors import ControllerError, DvrkDrakeError
-from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.systems.ros.confirmation import repeat_until_confirmed
 from dvrk_drake.systems.ros.discovery import END_OTHER_PROCESS, find_topic, wait_unless_stopped
@@ -24,6 +23,8 @@ from dvrk_drake.systems.ros.topic import Publisher, Subscription
 #: Longest time until the arm has sent its state and a measurement [s]. Longest time until DDS detects the end of a
 #: killed process of this package [s].
 _FIRST, _ENDED = 5.0, 3.0
+#: Time after which an unanswered "disable" is repeated [s].
+_REPEAT = 0.25
 #: Topics with which a client moves an arm. A second publisher on one of them could move the arm at the same time.
 _MOTION_TOPICS = (
     "servo_jp",
@@ -47,8 +48,8 @@ _MOTION_TOPICS = (
 _SEPARATE_TOPICS = ("servo_jp", "servo_jf", "move_jp")
 
 
-class CrtkClient:
-    """Publishes commands to one arm, and receives its measurements and its operating state.
+class CrtkObserver:
+    """Receives the measurements and the operating state of one arm, and can stop it. It commands no motion.
 
     Attributes:
         arm: Arm with n joints.
@@ -62,7 +63,7 @@ class CrtkClient:
     """
 
     def __init__(self, domain: RosDomain, arm: Arm, namespace: str, *, polled: bool = False) -> None:
-        """Creates the publishers and subscriptions of an arm.
+        """Creates the subscriptions to an arm.
 
         Args:
             domain: ROS domain of the arm.
@@ -74,30 +75,22 @@ class CrtkClient:
         Raises:
             ArmError: The arm has locked joints.
         """
-        arm.refuse_locked_joints("a client of a dVRK")
+        arm.refuse_locked_joints("a dVRK on ROS 2")
         self.arm, self.namespace, self.domain = arm, namespace, domain
         self.measurement: JointMeasurement | None = None
         self.operating_state: OperatingState | None = None
         self.gravity_compensation: float | None = None
         self.num_received = 0
-        self._separate = arm.joint_names.index(arm.separate_joint) if arm.separate_joint else None
         self._reader = JointStateReader(arm, self._topic("measured_js"))
         subscribe = domain.subscribe
         self._measured: Subscription[JointState] = subscribe(self._topic("measured_js"), JointState, wakes=not polled)
         self._state = self._subscribe_to_state()
         self._gravity = subscribe(self._topic("gravity_compensation/setpoint_js"), JointState)
-        self._other_hold = subscribe(self._topic("hold"), Empty, ignore_own=True, wakes=False)
-        self._jaw = None if self._separate is None else subscribe(self._jaw_topic("measured_js"), JointState)
-        self._servo_jp = self._advertise("servo_jp")
-        self._servo_jf = self._advertise("servo_jf")
-        self._move_jp = self._advertise("move_jp")
-        if self._separate is not None:
-            self._jaw_commands = {
-                name: domain.advertise(self._jaw_topic(name), JointState) for name in _SEPARATE_TOPICS
-            }
-        self._hold = domain.advertise(self._topic("hold"), Empty)
-        self._use_gravity_compensation = domain.advertise(self._topic("use_gravity_compensation"), Bool)
-        self._state_command = domain.advertise(self._topic("state_command"), StringStamped)
+        self._jaw = subscribe(self._jaw_topic("measured_js"), JointState) if arm.separate_joint else None
+
+    def close(self) -> None:
+        """Leaves the ROS domain."""
+        self.domain.close()
 
     @property
     def not_ready_reason(self) -> str:
@@ -141,6 +134,77 @@ class CrtkClient:
         """Forgets the operating state, and subscribes again to the last message of each of its publishers."""
         self._state.close()
         self.operating_state, self._state = None, self._subscribe_to_state()
+
+    def other_publishers(self) -> list[str]:
+        """Returns the topics on which another process of the domain could move the arm, see `other_publishers`."""
+        return other_publishers(self.domain, self.arm, self.namespace)
+
+    def stop(self, seconds: float) -> bool:
+        """Publishes `hold` until the arm has confirmed it, at most `seconds` [s]. Returns whether it has.
+
+        Raises:
+            DvrkDrakeError: DDS cannot send the message.
+        """
+        return self._hold_until_confirmed(self.domain.advertise(self._topic("hold"), Empty), seconds)
+
+    def switch_power_off(self, seconds: float) -> bool:
+        """Sends "disable" until the motors have no power, at most `seconds` [s]. Returns whether they have none.
+
+        An arm without brakes falls.
+
+        Raises:
+            DvrkDrakeError: DDS cannot send the message.
+        """
+        command = self.domain.advertise(self._topic("state_command"), StringStamped)
+        end = time.monotonic() + seconds
+
+        def is_off() -> bool:
+            self.receive_state()
+            return self.operating_state is not None and self.operating_state.state in ("DISABLED", "FAULT")
+
+        while not is_off() and time.monotonic() < end:
+            command.publish(StringStamped(Header.now(), "disable"))
+            self.domain.wait_until(is_off, _REPEAT)
+        return is_off()
+
+    def _hold_until_confirmed(self, hold: Publisher[Empty], seconds: float) -> bool:
+        end = time.monotonic() + seconds
+
+        def attempt(longest: float) -> bool:
+            hold.publish(Empty())
+            is_received = hold.wait_until_received(longest)
+            return is_received and bool(self._state.publisher_participants() & hold.subscriber_participants())
+
+        return repeat_until_confirmed(attempt, lambda: time.monotonic() >= end)
+
+    def _subscribe_to_state(self) -> Subscription[OperatingState]:
+        return self.domain.subscribe(self._topic("operating_state"), OperatingState, depth=100, latched=True)
+
+    def _topic(self, name: str) -> str:
+        return f"{self.namespace}/{name}"
+
+    def _jaw_topic(self, name: str) -> str:
+        return self._topic(f"{self.arm.separate_joint}/{name}")
+
+
+class CrtkClient(CrtkObserver):
+    """Observer of one arm that also publishes commands to it."""
+
+    def __init__(self, domain: RosDomain, arm: Arm, namespace: str, *, polled: bool = False) -> None:
+        """Creates the subscriptions and publishers of an arm; see `CrtkObserver`."""
+        super().__init__(domain, arm, namespace, polled=polled)
+        self._separate = arm.joint_names.index(arm.separate_joint) if arm.separate_joint else None
+        self._other_hold = domain.subscribe(self._topic("hold"), Empty, ignore_own=True, wakes=False)
+        self._servo_jp = self._advertise("servo_jp")
+        self._servo_jf = self._advertise("servo_jf")
+        self._move_jp = self._advertise("move_jp")
+        if self._separate is not None:
+            self._jaw_commands = {
+                name: domain.advertise(self._jaw_topic(name), JointState) for name in _SEPARATE_TOPICS
+            }
+        self._hold = domain.advertise(self._topic("hold"), Empty)
+        self._use_gravity_compensation = domain.advertise(self._topic("use_gravity_compensation"), Bool)
+        self._state_command = domain.advertise(self._topic("state_command"), StringStamped)
 
     def take_other_hold(self) -> bool:
         """Returns whether another process has published `hold` since the last call."""
@@ -208,13 +272,7 @@ class CrtkClient:
         Raises:
             DvrkDrakeError: DDS cannot send the message.
         """
-        end = time.monotonic() + seconds
-
-        def attempt(longest: float) -> bool:
-            self.hold()
-            return self._hold.wait_until_received(longest) and not self.unheard_commands(["hold"])
-
-        return repeat_until_confirmed(attempt, lambda: time.monotonic() >= end)
+        return self._hold_until_confirmed(self._hold, seconds)
 
     def unheard_commands(self, names: Sequence[str]) -> list[str]:
         """Returns the command topics to which the DDS participant that publishes operating_state does not subscribe.
@@ -230,13 +288,6 @@ class CrtkClient:
         }
         arm = self._state.publisher_participants()
         return [publishers[name].topic for name in names if not arm & publishers[name].subscriber_participants()]
-
-    def other_publishers(self) -> list[str]:
-        """Returns the topics on which another process of the domain could move the arm, see `other_publishers`."""
-        return other_publishers(self.domain, self.arm, self.namespace)
-
-    def _subscribe_to_state(self) -> Subscription[OperatingState]:
-        return self.domain.subscribe(self._topic("operating_state"), OperatingState, depth=100, latched=True)
 
     def _position_command(self, name: str, q: ArrayLike, v: ArrayLike | None) -> JointState:
         message = JointState(Header.now(), position=self._main(self._checked(name, q)))
@@ -261,12 +312,6 @@ class CrtkClient:
         if self._separate is not None:
             del numbers[self._separate]
         return numbers
-
-    def _topic(self, name: str) -> str:
-        return f"{self.namespace}/{name}"
-
-    def _jaw_topic(self, name: str) -> str:
-        return self._topic(f"{self.arm.separate_joint}/{name}")
 
     def _advertise(self, name: str) -> Publisher[JointState]:
         return self.domain.advertise(self._topic(name), JointState)
@@ -369,64 +414,3 @@ def connect_client(
         if text := problem():
             raise ControllerError(text)
     return client
-
-
-def publish_hold(domain: RosDomain, namespace: str, seconds: float) -> bool:
-    """Publishes `hold` of an arm until the arm has confirmed it, at most `seconds` [s]. Returns whether it has.
-
-    Raises:
-        DvrkDrakeError: DDS cannot send the message.
-    """
-    hold = domain.advertise(f"{namespace}/hold", Empty)
-    state = domain.subscribe(f"{namespace}/operating_state", OperatingState, latched=True)
-    end = time.monotonic() + seconds
-
-    def attempt(longest: float) -> bool:
-        hold.publish(Empty())
-        is_received = hold.wait_until_received(longest)
-        return is_received and bool(state.publisher_participants() & hold.subscriber_participants())
-
-    return repeat_until_confirmed(attempt, lambda: time.monotonic() >= end)
-
-
-class CrtkObserver:
-    """Receives the measurements of one arm without publishing anything. Other processes may control the arm."""
-
-    def __init__(
-        self,
-        domain: RosDomain,
-        arm: Arm,
-        topic: str | None = None,
-        report: Callable[[str], None] = lambda line: None,
-        stopped: Callable[[], bool] = lambda: False,
-    ) -> None:
-        """Finds the arm and subscribes to its measurements; see `find_arm` for the arguments."""
-        namespace = find_arm(domain, arm, topic, report=report, stopped=stopped)
-        self._domain, self._arm = domain, arm
-        self._reader = JointStateReader(arm, f"{namespace}/measured_js")
-        self._measured = domain.subscribe(f"{namespace}/measured_js", JointState)
-        jaw = f"{namespace}/{arm.separate_joint}/measured_js"
-        self._jaw = domain.subscribe(jaw, JointState) if arm.separate_joint else None
-
-    def next_status(self, seconds: float) -> lcmt_dvrk_status:
-        """Returns the next measurement as a status with the measured values only.
-
-        Raises:
-            ControllerError: No valid measurement arrives within `seconds`.
-        """
-        end, problem = time.monotonic() + seconds, f"no message on {self._measured.topic} for {seconds:g} s"
-        while (left := end - time.monotonic()) > 0:
-            self._domain.wait(left)
-            for message, _ in self._jaw.take() if self._jaw else ():
-                self._reader.read_jaw(message, time.monotonic_ns())
-            for message, _ in self._measured.take():
-                measured = self._reader.read(message, time.monotonic_ns())
-                problem = measured.problem
-                if not problem:
-                    status = lcmt_dvrk_status()
-                    status.arm_name, status.num_joints = self._arm.name, self._arm.num_joints
-                    status.utime = measured.stamp // 1000
-                    status.position, status.velocity = measured.q.tolist(), measured.v.tolist()
-                    status.effort_measured = measured.effort.tolist()
-                    return status
-        raise ControllerError(problem)

@@ -1,31 +1,31 @@
-"""Commands for an arm over LCM: keygen, control, status and stop."""
+"""Commands for a connected arm: keygen, control, status and stop."""
 
 from __future__ import annotations
 
 import sys
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from dvrk_drake.cli.app import HARDWARE, CollectedArm, ControlledArm, LcmArm, app
+from dvrk_drake.cli.app import HARDWARE, ConnectedArm, ControlledArm, app
 from dvrk_drake.cli.support import (
     interrupt_ends_process,
-    load_key,
+    print_line,
     print_warning,
     print_written,
     request_realtime,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
 
     from dvrk_drake.models.arm_schema import Gains
-    from dvrk_drake.processes.connection import ArmConnection, Dialog
+    from dvrk_drake.processes.arm_session import Dialog
+    from dvrk_drake.processes.connection import ArmConnection
     from dvrk_drake.systems.friction_compensator import FrictionCompensator
     from dvrk_drake.systems.gravity_pid_controller import Mode
-    from dvrk_drake.systems.lcm.arm_link import LcmArmLink
 
 
 @app.command(group=HARDWARE)
@@ -47,7 +47,7 @@ def keygen(*, output: Annotated[str, Parameter(metavar="FILE")]) -> None:
 @app.command(group=HARDWARE)
 def control(
     *,
-    controlled: CollectedArm,
+    controlled: ControlledArm,
     mode: Literal["gravity", "damped", "guide", "hold"] = "gravity",
     gains: Annotated[str | None, Parameter(metavar="GAINS.yaml")] = None,
     friction_ratio: Annotated[float, Parameter(metavar="R")] = 0.0,
@@ -66,14 +66,14 @@ def control(
         friction_model: Model with the friction parameters, identified from a motion. Default: the model of --model.
     """
     from dvrk_drake.dynamics.slip_effort import is_cross_validated
-    from dvrk_drake.processes.connection import Dialog
+    from dvrk_drake.processes.arm_session import Dialog
     from dvrk_drake.processes.live_status import LiveLine, LiveStatus
 
     controlled.check(lcm={"reset": controlled.reset})
     with interrupt_ends_process():
         compensator = _friction_compensator(controlled, mode, friction_ratio, hysteresis_ratio, friction_model)
         checked_gains = None if gains is None else _gains(gains, mode, controlled.arm)
-        connection = connect_arm(controlled, Dialog(report=lambda line: print(line, flush=True)))
+        connection = connect_arm(controlled, Dialog(report=print_line))
     if mode == "guide" and not is_cross_validated(connection.model):
         print_warning(
             "the error of the model at rest is unknown, because it was not identified from static poses; virtual "
@@ -99,56 +99,45 @@ def control(
 
 
 @app.command(group=HARDWARE)
-def status(*, connected: LcmArm, watch: bool = False) -> None:
+def status(*, connected: ConnectedArm, watch: bool = False) -> None:
     """Print the state of an arm, its reason, and what to do next.
+
+    The topics of a dVRK on ROS 2 do not state what a guard counts, e.g. refused commands.
 
     Args:
         watch: Repeat until Ctrl-C.
     """
-    from dvrk_drake.models.arm_files import load_arm
-    from dvrk_drake.processes.arm_operator import observe
+    from dvrk_drake.processes.arm_session import Dialog
     from dvrk_drake.reports.arm_status import status_page
     from dvrk_drake.reports.terminal import make_console, print_page
 
-    loaded, console = load_arm(connected.arm), make_console()
-    with suppress(KeyboardInterrupt), _operator_link(connected) as link:
-        while True:
-            observation = observe(link)
+    connected.check()
+    connection, console = connected.connect(Dialog(report=print_line)), make_console()
+    with suppress(KeyboardInterrupt), closing(connection.watch()) as observations:
+        for observation in observations:
             if watch:
                 console.clear()
-            print_page(console, status_page(loaded, observation))
+            print_page(console, status_page(connection.arm, observation))
             if not watch:
                 return
 
 
 @app.command(group=HARDWARE)
-def stop(*, connected: LcmArm, power_off: bool = False) -> None:
-    """Stop an arm. Its guard holds it until an operator resumes.
+def stop(*, connected: ConnectedArm, power_off: bool = False) -> None:
+    """Stop an arm.
 
-    The guard obeys every sender with the key, also while a controller acts. This does not replace the emergency stop
-    button.
+    LCM: the guard obeys every sender with the key, also while a controller acts, and holds the arm until an operator
+    resumes. ROS 2: the arm receives hold. A program that continues to publish commands moves it again; a bridge does
+    not. This command does not replace the emergency stop button.
 
     Args:
         power_off: Also switch the motor power off. An arm without brakes falls.
     """
-    from dvrk_drake.models.lcm_messages import describe_state
-    from dvrk_drake.processes.arm_operator import stop_arm
+    from dvrk_drake.processes.arm_session import Dialog
 
-    with _operator_link(connected) as link:
-        after = stop_arm(link, power_off=power_off)
-        print(f"{after.arm_name} is stopped: {describe_state(after.guard_state, after.fault_text)}", flush=True)
-
-
-@contextmanager
-def _operator_link(connected: LcmArm) -> Iterator[LcmArmLink]:
-    """Opens the channels of an arm for an operator, whatever its state is."""
-    from dvrk_drake.models.arm_files import load_arm
-    from dvrk_drake.systems.lcm.arm_link import LcmArmLink
-    from dvrk_drake.systems.lcm.lcm_network import open_lcm
-
-    url = open_lcm(connected.lcm_url).get_lcm_url()
-    with closing(LcmArmLink(load_arm(connected.arm), url, key=load_key(connected.key))) as link:
-        yield link
+    connected.check()
+    connection = connected.connect(Dialog(report=print_line))
+    print_line(f"{connection.arm.name} is stopped: {connection.hold(power_off=power_off)}")
 
 
 def _gains(path: str, mode: Mode, arm: str) -> Gains:
@@ -226,7 +215,7 @@ def connect_arm(controlled: ControlledArm, dialog: Dialog) -> ArmConnection:
     """
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.models.arm_files import load_arm
-    from dvrk_drake.processes.connection import connect, model_warning
+    from dvrk_drake.processes.connection import model_warning
     from dvrk_drake.processes.pace import settle_memory
     from dvrk_drake.processes.simulated_arm import stop_on_signals
 
@@ -237,20 +226,10 @@ def connect_arm(controlled: ControlledArm, dialog: Dialog) -> ArmConnection:
         settle_memory()
         request_realtime(controlled.realtime)
 
-    arm, model = load_arm(controlled.arm), None
+    model = None
     if controlled.model is not None:
-        model = IdentifiedModel.load(controlled.model, arm)
+        model = IdentifiedModel.load(controlled.model, load_arm(controlled.arm))
         if warning := model_warning(controlled.model, model):
             print_warning(warning)
-    return connect(
-        arm,
-        cast(Literal["lcm", "ros"], getattr(controlled, "transport", "lcm")),
-        model=model,
-        lcm_url=controlled.lcm_url,
-        key=controlled.key,
-        topic=getattr(controlled, "topic", None),
-        domain=getattr(controlled, "domain", None),
-        reset=controlled.reset,
-        dialog=replace(dialog, stopped=lambda: any(handler() for handler in handlers)),
-        ready=ready,
-    )
+    dialog = replace(dialog, stopped=lambda: any(handler() for handler in handlers))
+    return controlled.connect(dialog, model=model, reset=controlled.reset, ready=ready)

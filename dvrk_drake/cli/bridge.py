@@ -9,7 +9,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from dvrk_drake.cli.app import Arm, Gravity, Instrument, Key, LcmUrl, Model, Realtime, RosDomain, RosTopic, bridge
-from dvrk_drake.cli.support import driver_configuration, interrupt_ends_process, mounted, request_realtime
+from dvrk_drake.cli.support import driver_configuration, interrupt_ends_process, mounted, print_line, request_realtime
 from dvrk_drake.errors import ControllerError
 
 
@@ -70,7 +70,7 @@ def bridge_arm(
         domain=domain,
         polls=poll,
         stopped=stopped,
-        report=lambda line: print(line, flush=True),
+        report=print_line,
         ready=ready,
         enter=EnterKey.of_terminal(),
     )
