@@ -30,6 +30,7 @@ def observe_dvrk(observer: CrtkObserver, seconds: float, options: str) -> ArmObs
         options: Options of a command line for this arm, for the next step.
     """
     domain, arm, received = observer.domain, observer.arm, list[JointMeasurement]()
+    num_before, start = observer.num_received, time.monotonic()
 
     def receive() -> bool:
         if observer.receive() and observer.measurement is not None:
@@ -46,9 +47,7 @@ def observe_dvrk(observer: CrtkObserver, seconds: float, options: str) -> ArmObs
     rate = 1e9 / float(np.median(intervals)) if intervals.any() else 0.0
     why, next_step = _explain(observer, received, rate, options)
     state = observer.operating_state
-    words = ["operating state unknown"]
-    if state is not None:
-        words = [shown(state.state), "homed" if state.is_homed else "not homed", "moves by itself" * state.is_busy]
+    words = ["operating state unknown"] if state is None else [shown(state.state), "moves by itself" * state.is_busy]
     nothing = np.full(arm.num_joints, np.nan)
     q, v, effort = np.mean([(m.q, m.v, m.effort) for m in received] or [(nothing,) * 3], axis=0)
     return ArmObservation(
@@ -56,7 +55,7 @@ def observe_dvrk(observer: CrtkObserver, seconds: float, options: str) -> ArmObs
         why=why,
         next_step=next_step,
         is_fault=state is not None and state.state == "FAULT",
-        notes=_notes(observer, received, rate),
+        notes=_notes(observer, (observer.num_received - num_before) / (time.monotonic() - start)),
         q=q,
         v=v,
         effort=effort,
@@ -65,16 +64,16 @@ def observe_dvrk(observer: CrtkObserver, seconds: float, options: str) -> ArmObs
     )
 
 
-def _notes(observer: CrtkObserver, received: Sequence[JointMeasurement], rate: float) -> list[str]:
-    """Returns what the topics state, and what only the guard knows."""
+def _notes(observer: CrtkObserver, rate: float) -> list[str]:
+    """Returns what the topics state, and what is known only to a guard. `rate` is that of measured_js [Hz]."""
     gravity, topics = observer.gravity_compensation, ", ".join(observer.other_publishers())
     text = "unknown" if gravity is None else f"on, up to {gravity:.3g} N m or N" if gravity else "off"
     notes = [
         f"Gravity compensation of the dVRK: {text}.",
         f"Topics with which a process can move it: {topics or 'none'}.",
     ]
-    if received:
-        age = 1e-6 * (time.monotonic_ns() - received[-1].arrival)
+    if observer.measurement is not None:
+        age = 1e-6 * (time.monotonic_ns() - observer.measurement.arrival)
         notes.insert(0, f"measured_js: {rate:.0f} per second, the last one {age:.0f} ms ago.")
     return [*notes, "Unknown over ROS 2: state of a guard, rate of commands, refused commands and active limits."]
 
@@ -89,11 +88,14 @@ def _explain(
     if observer.operating_state is None:
         return f"no message arrives on {observer.namespace}/operating_state. Is it a dVRK?", restart
     state, last, others = observer.operating_state, received[-1], observer.other_publishers()
-    if reason := observer.not_ready_reason:
-        if state.state == "ENABLED" and state.is_busy:
-            return f"{reason} yet", "wait until the arm is homed"
+    if state.state != "ENABLED":
+        if state.state == "PAUSED":
+            return "it executes no commands", "resume the arm at its console"
         remove = "remove the cause of the fault, then " if state.state == "FAULT" else ""
-        return reason, f"{remove}enable and home the arm at its console"
+        return "the motors have no power", f"{remove}enable and home the arm at its console"
+    if not state.is_homed:
+        homes = "wait until the arm is homed" if state.is_busy else "home the arm at its console"
+        return "the arm is not homed", homes
     if last.problem or not np.isfinite(last.effort).all():
         return last.problem or "a measured effort is not finite", "check the sensors of the arm and its console"
     if len(received) > 1 and last.stamp == received[0].stamp:

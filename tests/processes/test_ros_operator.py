@@ -25,7 +25,13 @@ class Observed:
 
     def __init__(self):
         self.operating_state = SimpleNamespace(state="ENABLED", is_homed=True, is_busy=False)
-        self.measurement, self.gravity_compensation, self.others, self.period = None, 0.0, [], 1_000_000
+        self.num_received, self.measurement, self.gravity_compensation, self.others, self.period = (
+            0,
+            None,
+            0.0,
+            [],
+            1_000_000,
+        )
         self.q, self.problem, self.is_silent, self.stamp, self.step = np.zeros(7), "", False, 0, 1_000_000
         self.domain = SimpleNamespace(wait=lambda seconds: None, wait_until=lambda condition, seconds: condition())
         self.confirms, self.switches_off = True, True
@@ -63,13 +69,22 @@ def state(**values):
 @pytest.mark.parametrize(
     ("prepare", "why", "next_step"),
     [
-        (state(state="DISABLED"), "MTML: DISABLED, homed, operating_state is DISABLED.", "enable and home the arm"),
-        (state(state="FAULT"), "operating_state is FAULT.", "remove the cause of the fault, then enable and home"),
-        (state(is_homed=False), "ENABLED, not homed, operating_state is ENABLED, but the arm is not", "enable and"),
-        (state(is_homed=False, is_busy=True), "not homed, moves by itself", "wait until the arm is homed"),
+        (state(state="DISABLED"), "MTML: DISABLED, the motors have no power.", "enable and home the arm"),
+        (
+            state(state="FAULT"),
+            "MTML: FAULT, the motors have no power.",
+            "remove the cause of the fault, then enable and home",
+        ),
+        (state(state="PAUSED"), "MTML: PAUSED, it executes no commands.", "resume the arm"),
+        (state(is_homed=False), "MTML: ENABLED, the arm is not homed.", "home the arm at its console"),
+        (
+            state(is_homed=False, is_busy=True),
+            "ENABLED, moves by itself, the arm is not homed.",
+            "wait until the arm is homed",
+        ),
         (changed(is_silent=True), "no message arrives on /MTML/measured_js.", "check the dVRK's console"),
         (changed(operating_state=None), "operating state unknown, no message arrives on /MTML/operating_s", "check"),
-        (changed(problem="measured_js has 3 efforts"), "homed, measured_js has 3 efforts.", "check the sensors"),
+        (changed(problem="measured_js has 3 efforts"), "ENABLED, measured_js has 3 efforts.", "check the sensors"),
         (changed(step=0, stamp=5), "/MTML/measured_js repeats the same measurement.", "check the dVRK's console"),
         (changed(others=["/MTML/measured_js"]), "several processes publish /MTML/measured_js.", "end all but"),
         (
@@ -78,7 +93,7 @@ def state(**values):
             "publish at 500",
         ),
         (changed(q=ARM.position_upper + 0.1), "outside its limits, so controllers do not", "move the arm inside"),
-        (changed(), "MTML: ENABLED, homed, no process can move the arm.", f"dvrk-drake control {OPTIONS}"),
+        (changed(), "MTML: ENABLED, no process can move the arm.", f"dvrk-drake control {OPTIONS}"),
     ],
 )
 def test_status_explains_a_dvrk_that_does_not_move(prepare, why, next_step):
