@@ -37,6 +37,7 @@ def export_model(
     instrument: Instrument = "",
     sdf: Annotated[str | None, Parameter(metavar="FILE.sdf")] = None,
     urdf: Annotated[str | None, Parameter(metavar="FILE.urdf")] = None,
+    mjcf: Annotated[str | None, Parameter(metavar="FILE.xml")] = None,
     dvrk_gc: Annotated[str | None, Parameter(metavar="FILE.json")] = None,
     dvrk_kinematic_gc: Annotated[str | None, Parameter(metavar="FILE.json")] = None,
     configuration: Annotated[str | None, Parameter(metavar="ARM.json")] = None,
@@ -58,6 +59,7 @@ def export_model(
     Args:
         sdf: SDF file to write, with the inertias of the model. The meshes are copied to a folder next to the file.
         urdf: URDF file to write, with the inertias of the model. Joints of the linkage become mimic joints.
+        mjcf: MJCF file of MuJoCo to write, with the inertias, friction, springs and linkage of the model.
         dvrk_gc: Gravity-compensation file to write for an MTM, in the format of the dVRK controller.
         dvrk_kinematic_gc: Gravity-compensation file to write for a PSM, in the format of the dVRK controller.
         configuration: Configuration of the PSM in the dVRK, whose mounting_pitch is checked. Default: the JSON file
@@ -66,14 +68,15 @@ def export_model(
         diff: Print the differences between the SDF of the arm and the exported SDF.
         gc_tolerance: Largest accepted torque difference between the file and the model [N m; N]. Default: the dry
             friction of each joint, which holds a joint at rest despite such a difference.
-        friction: Also compensate the dry friction of the model. The model must be identified from a motion.
+        friction: Also compensate the dry friction of the model. The model must be identified from a motion. SDF and
+            URDF: add the friction of the joints, for other programs than Drake.
         coulomb: Also compensate Coulomb friction with these values, one per joint [N m]. Not allowed with --friction.
         friction_ratio: Share of the friction of each joint to compensate, 0 to 1. Default: 0.8 0.8 0.8 0.4 0.6 0.6 0.
         dead_band: Speed below which no friction is compensated [rad/s]. Default: 0.02 0.02 0.02 0.01 0.008 0.008 0.01.
         saturation: Speed above which the full --friction-ratio applies [rad/s]. Default: 0.4 0.2 0.2 0.4 0.4 0.2 0.4.
     """
     from dvrk_drake.dynamics.model_links import model_bodies
-    from dvrk_drake.export.model_export import configuration_beside, prepare_export
+    from dvrk_drake.export.model_export import MODEL_FORMATS, configuration_beside, prepare_export
     from dvrk_drake.export.model_writer import mesh_folder, refuse_existing_meshes, sdf_difference
     from dvrk_drake.reports.export import export_page
     from dvrk_drake.reports.terminal import make_console, print_page
@@ -81,6 +84,7 @@ def export_model(
     requested: dict[Format, str | None] = {
         "sdf": sdf,
         "urdf": urdf,
+        "mjcf": mjcf,
         "dvrk-gc": dvrk_gc,
         "dvrk-kinematic-gc": dvrk_kinematic_gc,
     }
@@ -97,7 +101,7 @@ def export_model(
     loaded = load_model(model, arm)
     for format, path in outputs.items():
         check_output(path, model or "", configuration or "", overwrite=overwrite)
-        if format in ("sdf", "urdf"):
+        if format in MODEL_FORMATS:
             refuse_existing_meshes(path, overwrite)
     settings: dict[str, Any] = {
         "tolerance": gc_tolerance,
@@ -122,7 +126,7 @@ def export_model(
             shapes = ", ".join(f"{shape} of {link}" for link, shape in omitted)
             print(f"Omitted in {path}, because they touch shapes of other links: {shapes}")
         print_written(path)
-        if format in ("sdf", "urdf"):
+        if format in MODEL_FORMATS and Path(path).with_name(mesh_folder(Path(path))).is_dir():
             print_written(Path(path).with_name(mesh_folder(Path(path))), "meshes")
     if tilt := loaded.provenance.base_tilt:
         what = f"the base of the recorded arm seems to be tilted, but the model assumes that it is not ({tilt})"

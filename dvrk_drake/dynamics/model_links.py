@@ -157,12 +157,16 @@ class ModelBodies:
         links: All moving links. A rotor that rotates with a link is part of this link, as in the SDF.
         rotors: Joint -> reflected rotor inertia [kg m^2; kg for a prismatic joint]. If it is empty, the rotor inertias
             of the SDF apply.
-        left_out: Descriptions of the terms of the model's torque that are not represented.
+        motors: Actuator -> inertia of its rotor [kg m^2, kg], for rotors that no link contains, from which `rotors`
+            follow. Formats with coupled rotors need no `rotors`. Empty if the rotor inertias of the SDF apply.
+        left_out: Descriptions of the terms of the model's torque that an SDF does not represent, by their kind:
+            "effects", "scale", "gravity", "drives" or "rotors".
     """
 
     links: tuple[LinkInertia, ...]
     rotors: dict[str, float]
-    left_out: list[str]
+    motors: dict[str, float]
+    left_out: dict[str, str]
 
 
 def model_bodies(model: IdentifiedModel) -> ModelBodies:
@@ -179,34 +183,34 @@ def model_bodies(model: IdentifiedModel) -> ModelBodies:
     # Simulators that load a file have this gravity vector by default.
     if not np.allclose(arm.gravity, [0.0, 0.0, -9.81], rtol=0, atol=0.02):
         gravity = ", ".join(f"{x:.3f}" for x in arm.gravity)
-        left_out.append(
+        left_out["gravity"] = (
             f"gravity ({gravity}) m/s^2 in the base frame; set this vector in the simulator that loads the file"
         )
     if model.dynamics is None:
         base_values = np.array([p.value for p in model.base_parameters])
-        return ModelBodies(nearest_links(arm, base_values), {}, left_out)
+        return ModelBodies(nearest_links(arm, base_values), {}, {}, left_out)
     if effects := model.dynamics.effects:
         coordinates = dict.fromkeys(effect.coordinate for effect in effects)
-        left_out.append(f"{len(effects)} drive effects (friction, cables, springs) along {', '.join(coordinates)}")
+        left_out["drives"] = f"{len(effects)} drive effects (friction, cables, springs) along {', '.join(coordinates)}"
     links = {link.link: np.array(link.parameters) for link in model.dynamics.links}
-    rotors, couplings = _assign_rotors(arm, links, [rotor.value for rotor in model.dynamics.rotors])
+    rotors, motors, couplings = _assign_rotors(arm, links, [rotor.value for rotor in model.dynamics.rotors])
     if couplings:
-        left_out.append(f"rotor inertias that couple joints, largest element [kg m^2]: {', '.join(couplings)}")
-    return ModelBodies(tuple(LinkInertia(name, phi) for name, phi in links.items()), rotors, left_out)
+        left_out["rotors"] = f"rotor inertias that couple joints, largest element [kg m^2]: {', '.join(couplings)}"
+    return ModelBodies(tuple(LinkInertia(name, phi) for name, phi in links.items()), rotors, motors, left_out)
 
 
-def _static_effects(model: IdentifiedModel) -> list[str]:
-    remarks = []
+def _static_effects(model: IdentifiedModel) -> dict[str, str]:
+    remarks = {}
     if effects := [f"{ActuatorEffect.of(e)} {e.coefficient:+.4g}" for e in model.effects]:
-        remarks.append(f"effects [N m; N if prismatic]: {', '.join(effects)}")
+        remarks["effects"] = f"effects [N m; N if prismatic]: {', '.join(effects)}"
     if excluded := [f"{j.name} {j.feedforward_scale:g}" for j in model.joints if j.feedforward_scale != 1.0]:
-        remarks.append(f"feedforward scale below 1: {', '.join(excluded)}")
+        remarks["scale"] = f"feedforward scale below 1: {', '.join(excluded)}"
     return remarks
 
 
 def _assign_rotors(
     arm: Arm, links: dict[str, NDArray[np.float64]], inertias: list[float]
-) -> tuple[dict[str, float], list[str]]:
+) -> tuple[dict[str, float], dict[str, float], list[str]]:
     """Assigns the inertia of each rotor to joints, or adds it to a link in `links` that rotates with the rotor.
 
     A rotor adds I J_k' J_k to the mass matrix, where I is the rotor inertia and J_k is the row of the motor in the
@@ -216,12 +220,13 @@ def _assign_rotors(
     physically consistent.
 
     Returns:
-        Joint -> rotor inertia, and descriptions of the rotors whose coupling terms are not represented.
+        Joint -> rotor inertia, actuator -> inertia of a rotor that no link contains, and descriptions of the rotors
+        whose coupling terms are not represented.
     """
     plant = shared_plant(arm)
     rotations = _rotation_rates(plant, arm)
     joints = np.zeros(arm.num_joints)
-    couplings = []
+    motors, couplings = {}, []
     for name, row, inertia in zip(arm.joint_names, arm.transmission.matrix, inertias, strict=True):
         candidates = [link for link, (rate, _) in rotations.items() if np.allclose(rate, row, atol=1e-9)]
         if np.count_nonzero(row) > 1 and candidates:
@@ -230,11 +235,12 @@ def _assign_rotors(
             axis = rotations[link][1]
             links[link] = links[link] + inertia * np.concatenate([np.zeros(4), _unit_rotor_inertia(axis)])
             continue
+        motors[name] = float(inertia)
         joints += inertia * row**2
         if np.count_nonzero(row) > 1 and inertia > 0:
             coupling = inertia * np.outer(row, row)
             couplings.append(f"{name} {np.abs(coupling - np.diag(np.diag(coupling))).max():.2g}")
-    return {name: float(x) for name, x in zip(arm.joint_names, joints, strict=True)}, couplings
+    return {name: float(x) for name, x in zip(arm.joint_names, joints, strict=True)}, motors, couplings
 
 
 def _unit_rotor_inertia(axis: NDArray[np.float64]) -> NDArray[np.float64]:

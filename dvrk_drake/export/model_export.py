@@ -10,6 +10,7 @@ from typing import Literal, get_args
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.model_links import ModelBodies, model_bodies
 from dvrk_drake.errors import ModelError
+from dvrk_drake.export.drive_approximation import DriveApproximation, approximate_drives
 from dvrk_drake.export.dvrk_mtm_controller import MTM_JOINTS
 from dvrk_drake.export.dvrk_mtm_gravity_compensation import CompensationOptions, compensation_from_model, dry_friction
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
@@ -23,8 +24,11 @@ from dvrk_drake.export.model_writer import MeshFormat, refuse_existing_meshes, w
 from dvrk_drake.export.touching_shapes import touching_shapes
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import refuse_existing
+from dvrk_drake.models.mjcf import Drive
 
-Format = Literal["sdf", "urdf", "dvrk-gc", "dvrk-kinematic-gc"]
+Format = Literal["sdf", "urdf", "mjcf", "dvrk-gc", "dvrk-kinematic-gc"]
+#: Formats of a complete model.
+MODEL_FORMATS = ("sdf", "urdf", "mjcf")
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,9 +39,11 @@ class ModelExport:
         model: Model that is exported.
         format: Format of the file.
         origin: Source of the model, written to the file.
-        bodies: Inertias of links and rotors in an SDF or URDF, and effects that this file omits. None for other
+        bodies: Inertias of links and rotors in an SDF, URDF or MJCF, and effects that this file omits. None for other
             formats.
-        compensation: Content of a file for the dVRK's controller. None for SDF and URDF.
+        drives: Friction and springs in an MJCF, or in an SDF or URDF with friction, and what they omit. None if the
+            file has no friction.
+        compensation: Content of a file for the dVRK's controller. None for SDF, URDF and MJCF.
         meshes: Format of the meshes of an SDF or URDF.
         configuration: Configuration of the arm in the dVRK with which the file of a PSM was checked, or None.
     """
@@ -46,9 +52,19 @@ class ModelExport:
     format: Format
     origin: str
     bodies: ModelBodies | None = None
+    drives: DriveApproximation | None = None
     compensation: GravityCompensationFile | KinematicCompensation | None = None
     meshes: MeshFormat = "gltf"
     configuration: str | Path | None = None
+
+    @property
+    def left_out(self) -> list[str]:
+        """Descriptions of the terms of the model that the file omits."""
+        if self.bodies is None:
+            return []
+        represented = {"gravity", "rotors"} if self.format == "mjcf" else set()
+        represented |= {"drives"} if self.drives is not None else set()
+        return [text for kind, text in self.bodies.left_out.items() if kind not in represented]
 
     @property
     def omitted_shapes(self) -> tuple[tuple[str, str], ...]:
@@ -67,12 +83,25 @@ class ModelExport:
         """
         arm = self.model.arm
         if self.bodies is not None:
-            assert self.format in ("sdf", "urdf")
-            write_model(arm, self.bodies.links, path, self.origin, self.bodies.rotors, self.meshes, self.format)
+            assert self.format in ("sdf", "urdf", "mjcf")
+            rotors, drives = self.bodies.rotors, self.drives.drives if self.drives is not None else ()
+            if self.format == "mjcf" and rotors:  # MJCF has rotors that are coupled to several joints
+                rotors, drives = dict.fromkeys(rotors, 0.0), (*drives, *self._motors())
+            write_model(arm, self.bodies.links, path, self.origin, rotors, self.meshes, self.format, drives)
         elif isinstance(self.compensation, GravityCompensationFile):
             self.compensation.save(path, arm.name, f"dvrk-drake export of {self.origin}")
         elif self.compensation is not None:
             self.compensation.save(path)
+
+    def _motors(self) -> list[Drive]:
+        """Returns the rotors that no link contains."""
+        assert self.bodies is not None
+        arm = self.model.arm
+        rows = dict(zip(arm.joint_names, arm.transmission.matrix, strict=True))
+        return [
+            Drive(f"rotor.{name}", {j: float(r) for j, r in zip(rows, rows[name], strict=True) if r}, inertia=inertia)
+            for name, inertia in self.bodies.motors.items()
+        ]
 
 
 def controller_format(arm: Arm) -> Format | None:
@@ -103,8 +132,11 @@ def prepare_export(
         raise ModelError(f'unknown format of meshes "{meshes}"; allowed: {", ".join(get_args(MeshFormat))}')
     if format != "dvrk-kinematic-gc":  # this file contains only yaw, pitch and insertion of a PSM
         model.arm.refuse_locked_joints(f"the format {format}")
-    if format in ("sdf", "urdf"):
-        return ModelExport(model, format, origin, bodies=model_bodies(model), meshes=meshes)
+    if format in MODEL_FORMATS:
+        drives = None
+        if format == "mjcf" or friction:
+            drives = approximate_drives(model, coupled=format == "mjcf")
+        return ModelExport(model, format, origin, bodies=model_bodies(model), drives=drives, meshes=meshes)
     if format == "dvrk-kinematic-gc":
         file = kinematic_compensation(model, tolerance, configuration)
         return ModelExport(model, format, origin, compensation=file, configuration=configuration)
@@ -140,14 +172,16 @@ def export_model(
     Args:
         model: Model from `identify`, `IdentifiedModel.load`, or `IdentifiedModel.from_arm`.
         path: Path of the file. Meshes of an SDF or URDF are copied into a folder <name>_meshes beside the file.
-        format: "sdf", "urdf", "dvrk-gc" or "dvrk-kinematic-gc". The last two are the gravity-compensation files of the
-            dVRK's controller for an MTM and for a PSM. None selects SDF or URDF by the file name extension.
+        format: "sdf", "urdf", "mjcf", "dvrk-gc" or "dvrk-kinematic-gc". The last two are the gravity-compensation
+            files of the dVRK's controller for an MTM and for a PSM. None selects SDF or URDF by the file name
+            extension. An MJCF contains friction, see `drives` of the result.
         origin: Source of the model, written to the file.
         tolerance: Largest accepted difference [N m, N] between the torques of the model and of a file for the dVRK's
             controller, on any joint. None: the dry friction of each joint, because this friction holds a joint at rest
             despite such a difference.
         friction: Coulomb friction (7,) [N m] to compensate, for "dvrk-gc". True uses the dry friction of the model's
-            dynamics. False compensates no friction.
+            dynamics. False compensates no friction. For SDF and URDF, True adds the friction of the joints. Programs
+            other than this package read it: Drake ignores dry friction, and `load_arm` refuses it.
         friction_ratio: Share of the friction to compensate on each joint (7,), 0 to 1, for "dvrk-gc". None uses
             typical values.
         dead_band: Speeds (7,) [rad/s] below which no friction is compensated, for "dvrk-gc". None uses typical values.
@@ -160,7 +194,7 @@ def export_model(
         overwrite: Whether to replace existing files.
 
     Returns:
-        Content of the written file. `bodies.left_out` describes effects that an SDF or URDF does not represent.
+        Content of the written file. `left_out` describes terms of the model that the file omits.
 
     Raises:
         ModelError: The format is unknown or cannot represent the model within the tolerance.
@@ -179,7 +213,7 @@ def export_model(
             raise ModelError(f"{path}: the format is not given; give one of {', '.join(get_args(Format))}")
         format = "sdf" if suffix == ".sdf" else "urdf"
     refuse_existing(path, overwrite)
-    if format in ("sdf", "urdf"):
+    if format in MODEL_FORMATS:
         refuse_existing_meshes(path, overwrite)
     export = prepare_export(
         model,

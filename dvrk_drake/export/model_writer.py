@@ -21,12 +21,15 @@ from dvrk_drake.export.gltf import to_obj
 from dvrk_drake.export.touching_shapes import touching_shapes
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import MAX_BINARY, atomic_write, open_input, read_json_input
+from dvrk_drake.models.mjcf import Drive, to_mjcf
 from dvrk_drake.models.plant import arm_sdf
 from dvrk_drake.models.sdf_elements import DRAKE
 from dvrk_drake.models.urdf import to_urdf
 
 #: Relative change of a parameter below which a link counts as unchanged.
 _UNCHANGED = 1e-12
+#: Number of random poses that an MJCF contains as keyframes.
+KEYFRAMES = 10
 #: Format of exported meshes. Only meshes in glTF format are converted to OBJ.
 MeshFormat = Literal["gltf", "obj"]
 
@@ -96,7 +99,8 @@ def write_model(
     origin: str,
     rotor_inertias: Mapping[str, float] | None = None,
     meshes: MeshFormat = "gltf",
-    format: Literal["sdf", "urdf"] = "sdf",
+    format: Literal["sdf", "urdf", "mjcf"] = "sdf",
+    drives: Sequence[Drive] = (),
 ) -> None:
     """Writes the model of `with_inertias` atomically, and copies its meshes into the folder <name>_meshes beside it.
 
@@ -105,7 +109,9 @@ def write_model(
         path: Path of the file.
         origin: Source of the inertias, written into a comment at the start of the file.
         meshes: "obj" converts glTF meshes to OBJ, for programs that do not read glTF, such as PyBullet and MuJoCo.
-        format: Format of the file. A URDF does not contain `touching_shapes`, see `to_urdf`.
+        format: Format of the file. A URDF does not contain `touching_shapes`, see `to_urdf`. The meshes of an MJCF are
+            OBJ files, and its keyframes are random poses of the arm.
+        drives: Friction, springs and rotors. SDF and URDF contain only the friction of single joints.
 
     Raises:
         ModelError: An argument is invalid, see `with_inertias`, or URDF does not support a part of the model.
@@ -113,7 +119,11 @@ def write_model(
     """
     target = Path(path)
     root = with_inertias(arm, links, rotor_inertias)
-    copies = redirect_meshes(root, target, meshes)
+    copies = redirect_meshes(root, target, "obj" if format == "mjcf" else meshes)
+    if format == "mjcf":
+        root = to_mjcf(root, arm.gravity, drives, _keyframes(arm))
+    else:
+        _add_friction(root, drives)
     if format == "urdf":
         for link in root.iterfind("model/link"):
             for shape in link.findall("collision"):
@@ -123,6 +133,32 @@ def write_model(
     copy_meshes(copies)
     with atomic_write(target) as stream:
         stream.write(to_text(root, f"{arm.name}, inertial parameters of {origin}. Written by dvrk-drake export."))
+
+
+def _keyframes(arm: Arm) -> dict[str, dict[str, float]]:
+    """Returns the positions of all joints at the home pose and at random poses."""
+    home = np.clip(0.0, arm.position_lower, arm.position_upper)
+    poses = [home, *arm.sample_poses(KEYFRAMES, np.random.default_rng(0))]
+    names = ["home", *(f"pose_{i}" for i in range(1, len(poses)))]
+    return {
+        name: dict(zip(arm.tree_joint_names, map(float, arm.linkage.position(q)), strict=True))
+        for name, q in zip(names, poses, strict=True)
+    }
+
+
+def _add_friction(root: ElementTree.Element, drives: Sequence[Drive]) -> None:
+    """Adds the friction of single joints to an SDF."""
+    joints = {joint.get("name"): joint for joint in root.iterfind("model/joint")}
+    for drive in drives:
+        (name,) = drive.row
+        axis = joints[name].find("axis")
+        assert axis is not None
+        dynamics = axis.find("dynamics")
+        dynamics = ElementTree.SubElement(axis, "dynamics") if dynamics is None else dynamics
+        damping = dynamics.find("damping")
+        damping = ElementTree.SubElement(dynamics, "damping") if damping is None else damping
+        damping.text = repr(float(damping.text or 0.0) + drive.viscous)
+        ElementTree.SubElement(dynamics, "friction").text = repr(drive.dry)
 
 
 def sdf_difference(arm: Arm, links: Sequence[LinkInertia], rotor_inertias: Mapping[str, float] | None = None) -> str:

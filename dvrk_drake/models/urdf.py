@@ -115,8 +115,9 @@ def _add_joint(
     effort, velocity = joint.findtext("axis/limit/effort", "0"), joint.findtext("axis/limit/velocity", NO_SPEED_LIMIT)
     limit = {"lower": repr(lower), "upper": repr(upper), "effort": effort, "velocity": velocity}
     ElementTree.SubElement(out, "limit", limit)
-    if (damping := joint.findtext("axis/dynamics/damping")) is not None:
-        ElementTree.SubElement(out, "dynamics", damping=damping)
+    terms = {tag: joint.findtext(f"axis/dynamics/{tag}") for tag in ("damping", "friction")}
+    if stated := {tag: value for tag, value in terms.items() if value is not None}:
+        ElementTree.SubElement(out, "dynamics", stated)
 
 
 def _add_transmission(robot: ElementTree.Element, joint: ElementTree.Element) -> None:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.model_links import ModelBodies
+from dvrk_drake.export.drive_approximation import DriveApproximation
 from dvrk_drake.export.dvrk_mtm_controller import MTM_JOINTS
 from dvrk_drake.export.dvrk_mtm_gravity_compensation import POSES, compensation_loss
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import CompensationComparison, JointComparison
@@ -18,6 +19,7 @@ from dvrk_drake.export.dvrk_psm_gravity_compensation import ARM_JOINTS, NAMES, K
 from dvrk_drake.export.gravity_compensation_loss import ROUNDING, CompensationLoss
 from dvrk_drake.export.model_export import ModelExport
 from dvrk_drake.export.model_writer import LinkChange, changed_links
+from dvrk_drake.models.arm import Arm
 from dvrk_drake.reports.colours import FITTED, LIMIT, NEUTRAL, REFERENCE, SERIES
 from dvrk_drake.reports.page import Block, Page, Plot, Section, Table, Text
 from dvrk_drake.reports.plot import Band, Curve, Guide, Mark, Panel, Style
@@ -62,9 +64,23 @@ def _bodies_page(path: str, export: ModelExport, bodies: ModelBodies) -> Page:
     if bodies.rotors:
         rotors = ", ".join(f"{name} {inertia:.3g}" for name, inertia in bodies.rotors.items())
         blocks.append(Text(f"Reflected rotor inertias [kg m^2; kg if prismatic]: {rotors}"))
-    blocks += [Text(f"Not exported: {remark}") for remark in bodies.left_out]
+    blocks += [Text(f"Not exported: {remark}") for remark in export.left_out]
+    if export.drives is not None:
+        blocks.append(_drive_table(export.model.arm, export.drives))
+        blocks.append(Text("Not exported: presliding friction, i.e. the elastic travel before a joint slides"))
     command = f"dvrk-drake export {_source(export.model, export.origin)} --diff"
     return Page(f"Exported model {path}", answer, [Section("Links", blocks)], "good", command)
+
+
+def _drive_table(arm: Arm, drives: DriveApproximation) -> Table:
+    """Returns a table with the effort of the drive effects on each joint, and the part that the file omits."""
+    rows = [
+        (name, f"{effort:.3g}", f"{difference:.2g}", f"{difference / effort:.0%}" if effort > 0 else "-")
+        for name, effort, difference in zip(arm.joint_names, drives.effort, drives.difference, strict=True)
+    ]
+    header = ("", "drive effects", "not exported", "share")
+    caption = "RMS effort of friction, cables and springs during a motion [N m; N if prismatic]"
+    return Table(header, rows, caption, right=[False, True, True, True])
 
 
 def _mass_table(changes: Sequence[LinkChange]) -> Table:
