@@ -17,7 +17,7 @@ from dvrk_drake.analysis.observations.excluded_measurements import (
 from dvrk_drake.analysis.results import JudgedError, Validation
 from dvrk_drake.analysis.verdict import NEGLIGIBLE, coverage, judge, rule_text, tolerances
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.recordings.recording import Coordinates, Recording, file_transmission
+from dvrk_drake.recordings.recording import Coordinates, Recording
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,9 +101,9 @@ def predict_static(
     arm = model.arm
     recording.check_fits(arm)
     tau = model.holding_torque(recording.in_joint_coordinates(arm).q)
-    if (coordinates or recording.coordinates) != "joint":
+    if (coordinates or recording.coordinates) == "actuator":
         # tau_joint = J' tau_actuator, so the inverse map transforms efforts from joints to actuators.
-        tau = file_transmission(arm, coordinates or recording.coordinates).inverse.pull_back_effort(tau)
+        tau = arm.transmission.inverse.pull_back_effort(tau)
     return tau
 
 
@@ -118,8 +118,6 @@ def validate_static(model: IdentifiedModel, recording: Recording) -> StaticValid
         RecordingError: The recording does not fit the model's arm, or has no efforts.
     """
     arm = model.arm
-    if recording.coordinates == "wpi":
-        recording = recording.in_joint_coordinates(arm)
     measured = recording.measured_effort()
     predicted = predict_static(model, recording)
     residuals = measured - predicted

@@ -22,7 +22,7 @@ from dvrk_drake.analysis.verdict import unexplained_effort
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.progress import Progress, step_progress
-from dvrk_drake.recordings.recording import MAX_PERIOD, MIN_ROWS, Coordinates, Recording, file_transmission
+from dvrk_drake.recordings.recording import MAX_PERIOD, MIN_ROWS, Coordinates, Recording
 
 
 def validate(
@@ -103,7 +103,7 @@ def predict(
     Args:
         model: Model from `identify` or `IdentifiedModel.load`.
         recording: Poses or a motion. Efforts are not required.
-        coordinates: Coordinates of the result: "joint", "actuator" or "wpi". Default: those of the recording.
+        coordinates: Coordinates of the result: "joint" or "actuator". Default: those of the recording.
         progress: Callback that receives the name of the step ("checking the recording" or "predicting") and the
             finished share of the step (0 to 1).
 
@@ -138,8 +138,8 @@ def predict(
     share(0.0)
     tau = predict_motion(model, observations)
     to_actuator = np.eye(arm.num_joints)
-    if (coordinates := coordinates or recording.coordinates) != "actuator":
-        to_actuator = arm.transmission.matrix @ file_transmission(arm, coordinates).inverse.matrix
+    if (coordinates or recording.coordinates) == "joint":
+        to_actuator = arm.transmission.matrix
         tau = tau @ to_actuator
     widths = [model.dynamic_model.combined_half_width(to_actuator.T, other_day=day) for day in (False, True)]
     same_day, other_day = (width if np.all(width > 0) else None for width in widths)

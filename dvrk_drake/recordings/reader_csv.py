@@ -2,13 +2,7 @@
 
 A file with the columns of messages sensor_msgs/JointState is read like a topic of a ROS bag.
 
-Layouts without a header, for an arm with n joints:
-
-- 3n columns: positions, velocities and efforts. For n = 7, this is the layout of the motions of WPI
-  (https://github.com/WPI-AIM/dvrk_dynamics_identification), which were sampled at 200 Hz.
-- 2n columns: positions and efforts of static poses. The script `dvrk_ecm_psm_gc_collect.py` of the dVRK
-  (https://github.com/jhu-dvrk/dvrk_python) writes such files for the first three joints of a PSM or of an
-  endoscope camera manipulator (ECM).
+The module `layouts` contains the layouts without a header.
 """
 
 from __future__ import annotations
@@ -20,7 +14,6 @@ from pathlib import Path
 
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.arm_files import is_package_arm
 from dvrk_drake.models.locked_joints import lock_hint
 from dvrk_drake.recordings.csv_rows import (
     CsvFile,
@@ -31,14 +24,12 @@ from dvrk_drake.recordings.csv_rows import (
     read_numbers,
 )
 from dvrk_drake.recordings.joint_states import MESSAGE_BLOCKS, JointState, collect_joint_states, joint_recording
+from dvrk_drake.recordings.layouts import Layout, find_layout
 from dvrk_drake.recordings.reader_options import FileOptions, sha256_of
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.recordings.topic_choice import check_namespace
 from dvrk_drake.recordings.writer_csv import UNITS
 
-#: Nominal sampling rate of the motions of WPI [Hz].
-WPI_RATE = 200.0
-_WPI_JOINTS = 7
 #: Columns with the same text in each row. `write_recording` and `collect` write them.
 _STATEMENTS = ("coordinates", "arm")
 #: Columns of messages sensor_msgs/JointState: data collection of the dVRK (header.stamp.sec, position with a list),
@@ -62,9 +53,8 @@ _TIME_NAMES = ("t", "time", "timestamp")
 def read_csv(path: Path, options: FileOptions) -> Recording:
     """Reads a recording from a CSV.
 
-    For an arm of this package and 21 columns without a header, the default coordinates are "wpi" and the default rate
-    is `WPI_RATE`. The default coordinates of all other files are those in the column `coordinates`, or else "joint".
-    Without times and rate, they contain static poses. The names of the columns may contain units.
+    The default coordinates are those in the column `coordinates` or of the layout, or else "joint". Without times and
+    rate, the rows are static poses. The names of the columns may contain units.
 
     Args:
         path: Path of the file.
@@ -87,12 +77,13 @@ def read_csv(path: Path, options: FileOptions) -> Recording:
     if is_headerless and comments and len(comments[-1][1]) == len(cells) and not any(map(is_number, comments[-1][1])):
         # np.savetxt writes the header as a comment.
         is_headerless, (line, cells) = False, comments[-1]
-    where = f"{path}, line {line}"
+    where, layout = f"{path}, line {line}", Layout(())
     if fields := _message_fields(where, cells):
         topic = next((comment[0][7:] for _, comment in comments if comment[0].startswith("Topic: ")), "")
         return _read_messages(file, line, cells, fields, topic, options)
     if is_headerless:
-        line, cells = line - 1, _assumed_header(path, where, len(cells), arm, n)
+        layout = _layout(path, where, len(cells), options)
+        line, cells = line - 1, layout.columns(n)
     header, units = _split_units(cells)
     blocks = _columns_of_blocks(where, _with_numbers(where, header, options), options)
     stated = _stated(file, line, header, arm)
@@ -105,7 +96,6 @@ def read_csv(path: Path, options: FileOptions) -> Recording:
         skip_invalid=options.skip_invalid,
         header_name="the first row" if is_headerless else "the header",
     )
-    is_wpi = is_headerless and len(header) == 3 * _WPI_JOINTS and (arm is None or is_package_arm(arm))
     used = {header[column] for columns in blocks.values() for column in columns} | {*_STATEMENTS}
     ignored = [name for name in header if name and name not in used]
     notes: tuple[str, ...] = ()
@@ -119,8 +109,8 @@ def read_csv(path: Path, options: FileOptions) -> Recording:
         {name: block[:, 0] if name == "t" else block for name, block in found.blocks.items()},
         found.rows,
         notes=(*notes, *found.notes, *_instrument_notes(stated, arm)),
-        default_rate=WPI_RATE if is_wpi else None,
-        default_coordinates="wpi" if is_wpi else "",
+        default_rate=layout.rate,
+        default_coordinates=layout.coordinates,
         lines=found.lines,
         sha256=sha256_of(path),
         times_from="column",
@@ -239,11 +229,11 @@ def _check_units(
                 )
 
 
-def _assumed_header(path: Path, where: str, width: int, arm: Arm | None, n: int) -> list[str]:
-    """Returns the names of the columns of a file without a header."""
-    for prefixes in (("q", "qd", "tau"), ("q", "tau")):
-        if width == n * len(prefixes):
-            return [f"{prefix}{i}" for prefix in prefixes for i in range(1, n + 1)]
+def _layout(path: Path, where: str, width: int, options: FileOptions) -> Layout:
+    """Returns the layout of a file without a header."""
+    arm, n = options.arm, options.num_joints
+    if layout := find_layout(width, arm, n):
+        return layout
     message = (
         f"{where}: the first row has {width} cell{'s' * (width != 1)} and no header. Allowed without a header for {n} "
         f"joints: {3 * n} columns (q, qd, tau) or {2 * n} (q, tau)"

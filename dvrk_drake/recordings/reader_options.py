@@ -7,7 +7,7 @@ import hashlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import open_input
-from dvrk_drake.recordings.recording import Coordinates, Recording
+from dvrk_drake.recordings.recording import FileCoordinates, Recording, wpi_transmission
 
 #: Number of joints of a file that is read without an arm.
 _DEFAULT_JOINTS = 7
@@ -26,7 +26,7 @@ class FileOptions:
     """Options of a reader. For the attributes, see the arguments of `read_recording`."""
 
     arm: Arm | None = None
-    coordinates: Coordinates | None = None
+    coordinates: FileCoordinates | None = None
     topic: str | None = None
     joints: Mapping[str, str] | None = None
     arrays: Mapping[str, str] | None = None
@@ -101,12 +101,12 @@ class FileOptions:
         *,
         notes: Iterable[str] = (),
         default_rate: float | None = None,
-        default_coordinates: Coordinates | Literal[""] = "",
+        default_coordinates: FileCoordinates | None = None,
         **facts: Any,
     ) -> Recording:
         """Returns the recording of a table, with the times and the coordinates of these options.
 
-        Data in "wpi" coordinates are converted to joint coordinates of the arm, if it is given.
+        Data in "wpi" coordinates are converted to joint coordinates of the arm.
 
         Args:
             path: Path of the file.
@@ -115,13 +115,13 @@ class FileOptions:
             notes: Notes on the rows.
             default_rate: Sampling rate [Hz] of a file without times if these options have no rate. None: the rows are
                 static poses, without times.
-            default_coordinates: Coordinates if neither the file nor these options state them, or "".
+            default_coordinates: Coordinates if neither the file nor these options state them, or None.
             facts: Other attributes of the recording. `times_from` is the source of t in the file, and
                 `file_coordinates` are the coordinates that the file states, or "".
 
         Raises:
-            RecordingError: The rate is not a positive number or is given for a file with times, or the file states
-                unknown coordinates or other coordinates than these options.
+            RecordingError: The rate is not a positive number or is given for a file with times, the file states unknown
+                coordinates or other coordinates than these options, or "wpi" coordinates are not those of an arm.
         """
         t, notes = blocks.get("t"), list(notes)
         if self.rate is not None:
@@ -137,17 +137,21 @@ class FileOptions:
             blocks["q"], blocks.get("tau"), blocks.get("qd"), t, source=str(path), notes=tuple(notes), **facts
         )
         stated = recording.file_coordinates
-        if stated and stated not in get_args(Coordinates):
-            allowed = ", ".join(get_args(Coordinates))
+        if stated and stated not in get_args(FileCoordinates):
+            allowed = ", ".join(get_args(FileCoordinates))
             raise RecordingError(f'{recording.where(0)}: coordinates is "{stated[:30]}"; allowed: {allowed}')
         if stated and self.coordinates and stated != self.coordinates:
             raise RecordingError(
                 f"{recording.where(0)}: the file states {stated} coordinates, not {self.coordinates}. Omit "
                 "--coordinates (coordinates= in Python)."
             )
-        coordinates = self.coordinates or stated or default_coordinates
-        recording = dataclasses.replace(recording, coordinates=coordinates or "joint", file_coordinates=coordinates)
-        return recording.in_joint_coordinates(self.arm) if self.arm and coordinates == "wpi" else recording
+        coordinates = self.coordinates or stated or default_coordinates or ""
+        recording = dataclasses.replace(recording, file_coordinates=coordinates)
+        if coordinates != "wpi":
+            return dataclasses.replace(recording, coordinates=coordinates or "joint")
+        arm = self.required_arm(path)
+        recording.check_joint_count(arm)
+        return recording.mapped(wpi_transmission(arm).inverse, "joint")
 
 
 def sha256_of(*paths: Path) -> str:

@@ -23,7 +23,7 @@ from dvrk_drake.recordings.reader_lerobot import is_lerobot, read_lerobot
 from dvrk_drake.recordings.reader_matlab import is_array_file, read_array_file
 from dvrk_drake.recordings.reader_options import FileOptions
 from dvrk_drake.recordings.reader_rosbag import is_ros_bag, read_ros_bag
-from dvrk_drake.recordings.recording import Coordinates, Recording
+from dvrk_drake.recordings.recording import FileCoordinates, Recording
 
 #: Number of bytes at the beginning of a text file that must not contain a null byte.
 _HEAD = 4096
@@ -70,7 +70,7 @@ FORMATS = (
 def read_recording(
     path: str | Path,
     arm: Arm | None = None,
-    coordinates: Coordinates | None = None,
+    coordinates: FileCoordinates | None = None,
     *,
     topic: str | None = None,
     joints: Mapping[str, str] | None = None,
@@ -122,8 +122,8 @@ def read_recording(
         >>> len(recording), recording.coordinates, recording.where(0)
         (8, 'joint', 'poses.csv, line 2')
     """
-    if coordinates is not None and coordinates not in get_args(Coordinates):
-        allowed = ", ".join(get_args(Coordinates))
+    if coordinates is not None and coordinates not in get_args(FileCoordinates):
+        allowed = ", ".join(get_args(FileCoordinates))
         raise RecordingError(f'unknown coordinates "{coordinates}"; allowed: {allowed}')
     path = Path(path)
     file_format = detect_format(path)

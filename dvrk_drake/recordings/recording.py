@@ -18,9 +18,11 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_schema import IMPLAUSIBLE
 from dvrk_drake.models.linear_map import LinearMap
 
-#: Coordinates of q, qd and tau. "wpi": actuator coordinates, except for the roll of a PSM, which is in joint
-#: coordinates (motions of WPI; Wang et al. 2019, table of the PSM).
-Coordinates = Literal["joint", "actuator", "wpi"]
+#: Coordinates of q, qd and tau.
+Coordinates = Literal["joint", "actuator"]
+#: Coordinates of a file. "wpi": actuator coordinates, except for the roll of a PSM, which is in joint coordinates
+#: (motions of WPI; Wang et al. 2019, table of the PSM).
+FileCoordinates = Literal["joint", "actuator", "wpi"]
 
 #: Tolerance of the position limits [rad], [m]. A pose that exceeds a limit by more is refused. Joint stops are
 #: compliant, so real poses may exceed the limits slightly.
@@ -60,8 +62,7 @@ class Recording:
         tau: Efforts (m, n) applied by the motors, or None.
         qd: Velocities (m, n), or None.
         t: Times (m,) [s], or None for static poses.
-        coordinates: Coordinates of q, qd and tau: "joint" or "actuator". "wpi" only if a file in these coordinates was
-            read without an arm.
+        coordinates: Coordinates of q, qd and tau: "joint" or "actuator".
         source: Source of the data, for messages.
         lines: Line number (m,) of each row in the source, or None. They are event numbers for an LCM log, message
             numbers for a ROS bag, and row or pose numbers for arrays.
@@ -69,7 +70,7 @@ class Recording:
         notes: Notes for the user on damaged and omitted parts of the source, one per line.
         line_label: Name of the numbers in `lines`, for messages: "line", "event", "message", "row" or "pose".
         file_coordinates: Coordinates that the source or the user states: "joint", "actuator" or "wpi". "" if they are
-            not stated. With an arm, the data of a file in the coordinates "wpi" are converted to joint coordinates.
+            not stated. The data of a file in the coordinates "wpi" are converted to joint coordinates.
         arm_name: Name of the arm that the source states, or "".
         times_from: Source of t: "column" of a table, "array", "messages" of an arm, or "rate" of the user.
 
@@ -91,7 +92,7 @@ class Recording:
     sha256: str = ""
     notes: tuple[str, ...] = ()
     line_label: str = "line"
-    file_coordinates: Coordinates | Literal[""] = ""
+    file_coordinates: FileCoordinates | Literal[""] = ""
     arm_name: str = ""
     times_from: Literal["column", "array", "messages", "rate"] = "array"
     # Caches: mapping from a transmission to this recording in the other coordinates, as long as that one is in use, and
@@ -102,7 +103,7 @@ class Recording:
     def __post_init__(self) -> None:
         where = self.source or "recording"
         if self.coordinates not in get_args(Coordinates):
-            raise RecordingError(f'{where}: coordinates is "{self.coordinates}"; allowed: joint, actuator, wpi')
+            raise RecordingError(f'{where}: coordinates is "{self.coordinates}"; allowed: joint, actuator')
         for name in ("q", "qd", "tau", "t"):
             if (values := getattr(self, name)) is not None:
                 object.__setattr__(self, name, np.asarray(values, float))
@@ -275,30 +276,30 @@ class Recording:
         return self._in_coordinates("actuator", arm)
 
     def _in_coordinates(self, coordinates: Coordinates, arm: Arm) -> Recording:
-        self._check_joint_count(arm)
+        self.check_joint_count(arm)
         if self.coordinates == coordinates:
             return self
         if arm.transmission in self._originals:
             return self._originals[arm.transmission]
-        is_wpi = self.coordinates == "wpi"
         # The same arm with another gravity vector has the same transmission.
         known = self._converted.get(arm.transmission)
         converted = known() if known is not None else None
         if converted is None:
             to_other = arm.transmission if coordinates == "actuator" else arm.transmission.inverse
-            if is_wpi:
-                to_other = file_transmission(arm, "wpi").inverse
-            converted = replace(
-                self,
-                q=to_other.position(self.q),
-                qd=None if self.qd is None else to_other.velocity(self.qd),
-                tau=None if self.tau is None else to_other.inverse.pull_back_effort(self.tau),
-                coordinates="joint" if is_wpi else coordinates,
-            )
+            converted = self.mapped(to_other, coordinates)
             self._converted[arm.transmission] = ref(converted)
-            if not is_wpi:
-                converted._originals[arm.transmission] = self
-        return converted._in_coordinates(coordinates, arm) if is_wpi else converted
+            converted._originals[arm.transmission] = self
+        return converted
+
+    def mapped(self, to_other: LinearMap, coordinates: Coordinates) -> Recording:
+        """Returns the recording in other coordinates. `to_other` is the map of the positions."""
+        return replace(
+            self,
+            q=to_other.position(self.q),
+            qd=None if self.qd is None else to_other.velocity(self.qd),
+            tau=None if self.tau is None else to_other.inverse.pull_back_effort(self.tau),
+            coordinates=coordinates,
+        )
 
     def __getstate__(self) -> dict[str, object]:
         # Another process converts again, because weak references cannot be sent to it.
@@ -345,7 +346,7 @@ class Recording:
         """Returns other values of `--coordinates` that move all poses of the file within the limits."""
         if self.coordinates != "joint" or self._originals or self.file_coordinates:
             return []
-        transmissions = {"wpi": file_transmission(arm, "wpi"), "actuator": arm.transmission}
+        transmissions = {"wpi": wpi_transmission(arm), "actuator": arm.transmission}
         if np.array_equal(transmissions["wpi"].matrix, arm.transmission.matrix):
             del transmissions["wpi"]
         return [
@@ -375,7 +376,8 @@ class Recording:
                 f"allowed: absolute values up to {IMPLAUSIBLE:g}"
             )
 
-    def _check_joint_count(self, arm: Arm) -> None:
+    def check_joint_count(self, arm: Arm) -> None:
+        """Raises RecordingError if the arm has another number of joints."""
         if self.q.shape[1] != arm.num_joints:
             source = self.source or "recording"
             raise RecordingError(
@@ -397,12 +399,8 @@ class Setpoints:
     tau: NDArray[np.float64] | None = None
 
 
-def file_transmission(arm: Arm, coordinates: Coordinates) -> LinearMap:
-    """Returns the map from joint coordinates to the coordinates of a file."""
-    if coordinates == "actuator":
-        return arm.transmission
-    if coordinates == "joint":
-        return LinearMap(np.eye(arm.num_joints), np.zeros(arm.num_joints))
+def wpi_transmission(arm: Arm) -> LinearMap:
+    """Returns the map from joint coordinates to the coordinates "wpi" of a file."""
     J = arm.transmission.matrix.copy()
     for joint in set(_WPI_DIRECT_JOINTS) & set(arm.joint_names):
         row = arm.joint_names.index(joint)

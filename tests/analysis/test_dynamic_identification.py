@@ -27,7 +27,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.models.linear_map import LinearMap
-from dvrk_drake.recordings.recording import Recording, file_transmission
+from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.recordings.writing import write_recording
 from dvrk_drake.reports.identification import identification_page
 from dvrk_drake.reports.terminal import TABLE_WIDTH
@@ -278,12 +278,12 @@ def test_motion_without_efforts_is_predicted_not_validated(case, tmp_path, capsy
         assert "always 0" not in printed and result.model.interval_scope in printed
     np.testing.assert_allclose(*predicted, rtol=0, atol=1e-12 * np.abs(predicted).max())
     arm, powers = result.model.arm, []
-    for coordinates in ("joint", "actuator", "wpi"):
+    for coordinates in ("joint", "actuator"):
         prediction = predict(result.model, recording, coordinates=coordinates)
-        v = file_transmission(arm, coordinates).velocity(recording.in_joint_coordinates(arm).qd)
-        powers.append(np.sum(prediction.tau * v, axis=1))
+        v = recording.in_joint_coordinates(arm) if coordinates == "joint" else recording.in_actuator_coordinates(arm)
+        powers.append(np.sum(prediction.tau * v.qd, axis=1))
         assert np.all(prediction.half_width > 0)
-    np.testing.assert_allclose(powers[1:], [powers[0]] * 2, rtol=0, atol=1e-9 * np.abs(powers[0]).max())
+    np.testing.assert_allclose(powers[1], powers[0], rtol=0, atol=1e-9 * np.abs(powers[0]).max())
     assert main(["validate", paths["without.csv"], "--model", paths["model.yaml"]]) == 2
     assert "has no efforts; needs columns tau1..tau7" in capsys.readouterr().err
 

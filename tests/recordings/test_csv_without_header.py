@@ -9,8 +9,8 @@ import pytest
 from public_files import NUMBERS, assert_refused, wpi_rows, write_text, write_wpi
 
 from dvrk_drake.models.arm_files import load_arm
+from dvrk_drake.models.locked_joints import lock_joints
 from dvrk_drake.recordings.reading import read_recording
-from dvrk_drake.recordings.writing import write_recording
 
 ARM = load_arm("mtml")
 
@@ -32,23 +32,10 @@ def test_21_columns_are_motions_of_wpi_at_200_hz(tmp_path):
     np.testing.assert_array_equal(read_recording(path, ARM, rate=10).t, [0, 0.1, 0.2, 0.3])
 
 
-def test_wpi_coordinates_without_an_arm_are_stated(tmp_path):
-    """The roll of a PSM is in joint coordinates, so these are not actuator coordinates."""
-    psm, rows = load_arm("psm"), 1e-2 * wpi_rows()
-    path = write_wpi(tmp_path, rows)
-    read = read_recording(path)
-    assert (read.coordinates, read.file_coordinates) == ("wpi", "wpi")
-    write_recording(read, tmp_path / "again.csv")
-    again = read_recording(tmp_path / "again.csv")
-    assert again.coordinates == "wpi"
-    np.testing.assert_array_equal(np.hstack([again.q, again.qd, again.tau]), rows)
-    for arm in (psm, ARM):
-        converted = read_recording(path, arm)
-        for name in ("q", "qd", "tau"):
-            for other in (again.in_joint_coordinates(arm), read_recording(tmp_path / "again.csv", arm)):
-                np.testing.assert_allclose(getattr(other, name), getattr(converted, name), atol=1e-12)
-            actuator = getattr(again.in_actuator_coordinates(arm), name)
-            np.testing.assert_allclose(actuator, getattr(converted.in_actuator_coordinates(arm), name), atol=1e-12)
+def test_wpi_coordinates_are_those_of_an_arm(tmp_path):
+    path = write_wpi(tmp_path, wpi_rows())
+    assert_refused("needs the arm whose joint states are read", read_recording, path)
+    assert_refused("7 joints, but .* has 6", read_recording, path, lock_joints(ARM, {"wrist_roll": 0.0}), "wpi")
 
 
 def test_other_arms_with_seven_joints_have_no_wpi_file(tmp_path):

@@ -413,12 +413,9 @@ def check_with_channels(observations: Observations) -> RecordingReport:
     sign. Exchanged channels have a similar effect to efforts with a wrong sign. A refusal for exchanged channels
     therefore replaces the refusals for wrong signs.
     """
-    recording, arm = observations.recording, observations.arm
-    if recording.coordinates == "wpi" and recording.q.shape[1] == arm.num_joints:
-        observations = Observations(recording.in_joint_coordinates(arm), arm, observations.settings)
     report = check_recording(observations)
     others = [finding for finding in report.refusals if finding.kind != "effort sign"]
-    if others or (report.kind == "motion" and not recording.motion(arm)):
+    if others or (report.kind == "motion" and not observations.recording.motion(observations.arm)):
         return report
     try:
         found = check_channels(observations)
