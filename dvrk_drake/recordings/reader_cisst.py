@@ -101,6 +101,8 @@ def read_collector(path: Path, options: FileOptions) -> Recording:
     states = JointStates(signal, tuple(labels), stamps[in_time], q, qd, tau, found.lines[rows], tuple(notes), "line")
     recording = joint_recording(path, states, options, sha256_of(data))
     coordinates = options.coordinates or stated
+    if coordinates == "wpi":
+        raise RecordingError(f"{path}: the cisst collector has no wpi coordinates; allowed: joint, actuator")
     return replace(recording, coordinates=coordinates, file_coordinates=coordinates)
 
 

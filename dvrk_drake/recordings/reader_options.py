@@ -121,7 +121,7 @@ class FileOptions:
 
         Raises:
             RecordingError: The rate is not a positive number or is given for a file with times, the file states unknown
-                coordinates or other coordinates than these options, or "wpi" coordinates are not those of an arm.
+                coordinates or other coordinates than these options, or "wpi" is given without an arm.
         """
         t, notes = blocks.get("t"), list(notes)
         if self.rate is not None:
@@ -149,9 +149,7 @@ class FileOptions:
         recording = dataclasses.replace(recording, file_coordinates=coordinates)
         if coordinates != "wpi":
             return dataclasses.replace(recording, coordinates=coordinates or "joint")
-        arm = self.required_arm(path)
-        recording.check_joint_count(arm)
-        return recording.mapped(wpi_transmission(arm).inverse, "joint")
+        return recording.mapped(wpi_transmission(self.required_arm(path)).inverse, "joint")
 
 
 def sha256_of(*paths: Path) -> str:

@@ -276,7 +276,7 @@ class Recording:
         return self._in_coordinates("actuator", arm)
 
     def _in_coordinates(self, coordinates: Coordinates, arm: Arm) -> Recording:
-        self.check_joint_count(arm)
+        self._check_joint_count(arm)
         if self.coordinates == coordinates:
             return self
         if arm.transmission in self._originals:
@@ -340,6 +340,8 @@ class Recording:
             message += f" All poses are within the limits with --coordinates {' or '.join(others)}."
         elif pairs := self._exchanges_within_limits(arm):
             message += f" All poses are within the limits if columns are exchanged: {', '.join(pairs)}."
+        elif self.tau is not None and _is_within(self.tau, arm) and np.all(np.abs(self.q) < arm.effort_limits):
+            message += " All rows are within the limits if the positions and the efforts are exchanged."
         raise RecordingError(message)
 
     def _coordinates_within_limits(self, arm: Arm) -> list[str]:
@@ -376,8 +378,7 @@ class Recording:
                 f"allowed: absolute values up to {IMPLAUSIBLE:g}"
             )
 
-    def check_joint_count(self, arm: Arm) -> None:
-        """Raises RecordingError if the arm has another number of joints."""
+    def _check_joint_count(self, arm: Arm) -> None:
         if self.q.shape[1] != arm.num_joints:
             source = self.source or "recording"
             raise RecordingError(

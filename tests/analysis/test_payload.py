@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from command_output import messages
 from loaded_arm import two_days
-from pydrake.multibody.tree import MultibodyForces
+from pydrake.multibody.tree import MultibodyForces, SpatialInertia
 from report_pages import printed
 
+import dvrk_drake as dvrk
 from dvrk_drake.analysis.estimation.point_mass import point_mass_parameters
 from dvrk_drake.analysis.motion_identification import identify_dynamic
 from dvrk_drake.analysis.observations.observations import Observations
@@ -23,9 +24,10 @@ from dvrk_drake.analysis.payload import payload as estimate
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.dynamics.inertial_parameters import LinkInertia, pseudo_inertia
+from dvrk_drake.dynamics.inertial_parameters import LinkInertia, link_inertias, pseudo_inertia
 from dvrk_drake.errors import ModelError, RecordingError
 from dvrk_drake.models.arm_files import load_arm
+from dvrk_drake.models.plant import inverse_dynamics as plant_inverse_dynamics
 from dvrk_drake.models.plant import make_arm_plant
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import Recording
@@ -310,3 +312,25 @@ def test_reports_a_real_payload_on_another_link(unloaded):
     assert_end_link_explains(
         point_masses(reference, loaded, model, LINKS),
     )
+
+
+@pytest.mark.slow
+def test_known_mass_at_the_flange_of_another_robot(shared_data):
+    """Drake's efforts of a mass are added to a recording of another day than that of the model."""
+    folder, mass, position = shared_data / "other_robots" / "ur10e", 3.0, [0.02, 0.0, 0.08]
+    if not folder.is_dir():
+        pytest.skip(f"needs {folder}")
+    arm = dvrk.load_arm(folder / "ur10e.urdf")
+    model = dvrk.identify(dvrk.read_recording(folder / "motion_30s.csv", arm), arm).model
+    unloaded = dvrk.read_recording(folder / "motion_50s_unloaded.csv", arm).select(slice(0, 2000))
+    grid, flange = Observations(unloaded, arm).grid, link_inertias(arm)[-1]
+    nominal = flange.to_spatial_inertia()
+    with_mass = SpatialInertia(nominal)
+    with_mass += SpatialInertia.PointMass(mass, position)
+    motion = grid.q, grid.v, grid.vd
+    with_it, without = (plant_inverse_dynamics(arm, *motion, {flange.link: M}) for M in (with_mass, nominal))
+    added = np.column_stack([np.interp(grid.row_times, grid.t, x) for x in (with_it - without).T])
+    loaded = dataclasses.replace(unloaded, tau=unloaded.tau + added)
+    payload = dvrk.payload(None, loaded, model, flange.link).payload
+    half_width = payload.quantile * payload.mass_error
+    assert abs(payload.body.mass - mass) < half_width < 0.075 * mass

@@ -129,6 +129,14 @@ def _hypotheses(fit: ChannelFit) -> Iterator[Finding]:
     for i, j in combinations(used, 2):
         which = f"all signals (q, qd, tau) of channels {i + 1} and {j + 1}"
         yield _exchange(arm, (i, j), which, _gain_of_channels(_exchanged(unit, i, j), fit))
+    if len(used) == arm.num_joints > 2:
+        channels = tuple(used)
+        yield _exchange(arm, channels, "the columns tau are in reverse order: they", fit.gain(unit[::-1]))
+        which = "all columns (q, qd, tau) are in reverse order: they"
+        yield _exchange(arm, channels, which, _gain_of_channels(unit[::-1], fit))
+    what = "all efforts have the wrong sign. The arm model fits much better with opposite signs"
+    advice = "Efforts must be positive in the direction of positive motion. Correct the signs and check the file again."
+    yield Finding("refusal", "effort sign", arm.name, what, advice, tuple(used), fit.gain(-unit))
     for i in used:
         gain = fit.gain(unit - 2 * np.diag(unit[i]))
         what = f"tau{i + 1} or q{i + 1} has the wrong sign. The arm model fits much better with the opposite sign"

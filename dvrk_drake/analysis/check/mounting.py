@@ -1,8 +1,7 @@
 """Finds the direction of gravity and the joint zeros with which the links of an arm explain a recording.
 
 A model file does not state how a robot is mounted. Its joint zeros may differ from those of the robot's controller, in
-most cases by multiples of 90 degrees. Other differences above 45 degrees are refined multiples. Smaller ones are found
-by `check_channels`.
+most cases by multiples of 90 degrees. Other differences above `SNAP_ANGLE` are estimated if gravity shows them.
 """
 
 from __future__ import annotations
@@ -77,7 +76,11 @@ def find_mounting(observations: Observations) -> tuple[Arm, list[Finding]]:
     gravity, offsets = search.best()
     scale = list(_scale_findings(arm, search.scale(gravity, offsets))) if has_converted_model(arm) else []
     found = _arm_with(arm, gravity, offsets)
-    if found is arm or _log_likelihood(own, found) - fit.log_likelihood < MIN_CONFIRMED_GAIN:
+    if found is arm:
+        return arm, scale
+    gain = _log_likelihood(own, found) - fit.log_likelihood
+    # Opposite gravity and opposite efforts differ by friction and inertia. `check_channels` reports the latter.
+    if gain < max(MIN_CONFIRMED_GAIN, fit.gain(-np.eye(arm.num_joints)) if fit.moves else 0.0):
         return arm, scale
     is_used = is_assumed(arm)
     return (found if is_used else arm), [*_findings(arm, gravity, offsets, is_used), *scale]
@@ -159,12 +162,18 @@ class _Search:
             if likelihood - current < MIN_GAIN:
                 break
             current, (gravity, offsets) = likelihood, best
-        for j in np.flatnonzero(offsets):
-            offsets = self._refined(gravity, offsets, int(j))
+        # The zeros of an arm of this package are checked by `check_channels`, with the priors of its links.
+        joints = np.flatnonzero(~self._arm.prismatic if has_converted_model(self._arm) else offsets)
+        for _ in joints:
+            refined = [self._refined(gravity, offsets, int(j)) for j in joints]
+            best_offsets = max(refined, key=lambda x: self._log_likelihood(gravity, x))
+            if np.array_equal(best_offsets, offsets):
+                break
+            offsets = best_offsets
         return gravity, offsets
 
     def _refined(self, gravity: NDArray[np.float64], offsets: NDArray[np.float64], joint: int) -> NDArray[np.float64]:
-        """Returns offsets (n,) in which that of a joint is the best near a multiple of 90 degrees, or the multiple."""
+        """Returns offsets (n,) in which that of a joint is the best within 45 degrees of its own, or the same ones."""
         own = np.arange(len(offsets)) == joint
         turn = float(offsets[joint])
 

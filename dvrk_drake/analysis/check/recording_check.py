@@ -261,6 +261,8 @@ def _time(observations: Observations, kind: str) -> list[Finding]:
         return [fault] if (fault := observations.fault) else []
     unit = next((name for name, size in TIME_UNITS.items() if abs(factor * size - 1) < TIME_TOLERANCE), "")
     cause = f"t may be in {unit}" if unit else "usual causes: a wrong rate, or qd in another unit"
+    for quantity, size in (("qd may be in deg/s", 180 / np.pi), ("q may be in degrees", np.pi / 180)):
+        cause = quantity if abs(factor / size - 1) < TIME_TOLERANCE else cause
     what = f"times increase {factor:.4g} times as fast as q and qd imply ({cause})"
     advice = "Use t in s, q in rad (m) and qd in rad/s (m/s)."
     return [Finding("refusal", "wrong time", "t", what, advice, size=factor)]

@@ -72,14 +72,20 @@ def check_effort_unit(recording: Recording, arm: Arm) -> None:
         RecordingError: The median absolute effort of a joint exceeds its limit.
     """
     typical = np.median(np.abs(recording.measured_effort()), axis=0)
-    if np.any(typical > arm.effort_limits):
-        joint = int(np.argmax(typical / arm.effort_limits))
-        unit = _effort_unit(arm, joint)
-        raise RecordingError(
-            f"{recording.source or 'recording'}: most efforts of {arm.joint_names[joint]} (tau{joint + 1}) exceed its "
-            f"limit of {arm.effort_limits[joint]:.3g} {unit}. Check the unit (N m, or N if prismatic) and the joint of "
-            "this column."
-        )
+    if np.all(typical <= arm.effort_limits):
+        return
+    joint = int(np.argmax(typical / arm.effort_limits))
+    unit = _effort_unit(arm, joint)
+    message = (
+        f"{recording.source or 'recording'}: most efforts of {arm.joint_names[joint]} (tau{joint + 1}) exceed its "
+        f"limit of {arm.effort_limits[joint]:.3g} {unit}. Check the unit (N m, or N if prismatic) and the joint of "
+        "this column."
+    )
+    if np.all(typical[::-1] <= arm.effort_limits):
+        message += " All joints are within their limits if the columns tau are in reverse order."
+    elif np.all(1e-3 * typical <= arm.effort_limits) and np.sum(typical > arm.effort_limits) > len(typical) / 2:
+        message += " If the efforts are in N mm, give --effort-scale 0.001 (effort_scale= in Python)."
+    raise RecordingError(message)
 
 
 def exclude_outliers(

@@ -1,12 +1,15 @@
-"""Finds faults that make all results of a motion meaningless: two sources, wrapped angles, jumps and wrong times."""
+"""Finds faults that make all results of a motion meaningless: exchanged quantities, two sources, jumps, wrong times."""
 
 from __future__ import annotations
+
+from itertools import permutations
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
 from dvrk_drake.analysis.observations.finding import Finding
+from dvrk_drake.analysis.observations.true_time import MAX_ROWS, velocity_agreement
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.csv_rows import listed
 from dvrk_drake.recordings.recording import (
@@ -46,16 +49,46 @@ TIME_UNITS = {
 #: Largest plausible RMS speed of a joint over a whole motion [rad/s], [m/s], and largest plausible rate [Hz].
 #: Industrial arms reach 10 rad/s only for moments, and arms publish at up to 3 kHz.
 MAX_SPEED, MAX_RATE = (10.0, 1.0), 10_000.0
+#: Largest deviation of the gain from 1 and largest mismatch at which columns are the time derivative of other columns.
+#: Efforts in place of velocities have gains of 6 to 100 (UR10e). Velocities of this robot with jittered times have
+#: deviations below 0.05 and mismatches below 0.2.
+MAX_GAIN_ERROR, MAX_MISMATCH = 0.2, 0.5
 
 
 def source_fault(recording: Recording, arm: Arm) -> Finding | None:
-    """Returns a fault of a motion whose rows have two sources or whose angles are wrapped, or None.
+    """Returns a fault of a motion with exchanged quantities, rows of two sources or wrapped angles, or None.
 
     Raises:
         RecordingError: The number of joints is wrong.
     """
     joints = recording.in_joint_coordinates(arm)
-    return _two_sources(recording, arm) or _wrapped_angle(recording, joints, arm)
+    return _exchanged_quantities(recording) or _two_sources(recording, arm) or _wrapped_angle(recording, joints, arm)
+
+
+def _exchanged_quantities(recording: Recording) -> Finding | None:
+    """Returns a fault if the columns of two quantities are exchanged: velocities are the derivatives of positions."""
+    if not (recording.is_motion and recording.has_increasing_times):
+        return None
+    t, blocks = np.asarray(recording.t)[:MAX_ROWS], {"q": recording.q, "qd": recording.qd, "tau": recording.tau}
+    given = {name: block[:MAX_ROWS] for name, block in blocks.items() if block is not None}
+
+    def share(position: str, velocity: str) -> float:
+        """Returns the share of the moving joints whose velocities are the derivatives of their positions."""
+        found = velocity_agreement(given[position], given[velocity], (len(t) - 1) / (t[-1] - t[0]))
+        fits = (np.abs(found.gain - 1) < MAX_GAIN_ERROR) & (found.mismatch < MAX_MISMATCH)
+        return float(np.mean(fits[np.isfinite(found.gain)])) if np.any(np.isfinite(found.gain)) else 0.0
+
+    if len(given) < len(blocks) or share("q", "qd") > 0:
+        return None
+    for position, velocity, effort in permutations(blocks):
+        if share(position, velocity) > 0.5:
+            what = (
+                f"the columns {velocity} are the time derivatives of the columns {position}, but the columns qd are "
+                f"not those of q. Positions are in {position}, velocities in {velocity}, efforts in {effort}"
+            )
+            advice = "Correct the names of the columns and check the file again."
+            return Finding("refusal", "exchanged quantities", "columns", what, advice)
+    return None
 
 
 def _two_sources(recording: Recording, arm: Arm) -> Finding | None:

@@ -8,9 +8,12 @@ from check_findings import ARMS, changed, found
 from synthetic_motion import RATE, clean_motion
 
 from dvrk_drake.analysis.check.recording_check import check_recording
+from dvrk_drake.analysis.observations.excluded_measurements import check_effort_unit
 from dvrk_drake.analysis.observations.low_pass import low_pass
 from dvrk_drake.analysis.observations.observations import Observations
+from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm_files import load_arm
+from dvrk_drake.recordings.recording import Recording
 
 pytestmark = pytest.mark.slow
 
@@ -105,6 +108,25 @@ def test_constant_efforts_at_rest_are_not_saturated(step):
 
 def test_refuses_efforts_in_another_unit():
     assert found(changed(clean_motion(), "tau", 1, lambda x: 1000 * x))["unusable"][0].severity == "refusal"
+
+
+@pytest.mark.parametrize(
+    ("change", "advice"),
+    [(lambda tau: 1e3 * tau, "in N mm, give --effort-scale 0.001"), (lambda tau: tau[:, ::-1], "in reverse order")],
+)
+def test_the_cause_of_efforts_above_the_limits_is_named(change, advice):
+    arm = load_arm("mtmr")
+    rows = Recording(q=np.zeros((3, 7)), tau=np.tile(0.9 * arm.effort_limits, (3, 1)))
+    check_effort_unit(rows, arm)
+    with pytest.raises(RecordingError, match=advice):
+        check_effort_unit(replace(rows, tau=change(rows.tau)), arm)
+
+
+def test_exchanged_positions_and_efforts_without_velocities_are_named():
+    arm = load_arm("psm")
+    rows = Recording(q=np.tile(0.9 * arm.effort_limits, (3, 1)), tau=np.tile(arm.position_upper, (3, 1)))
+    with pytest.raises(RecordingError, match="if the positions and the efforts are exchanged"):
+        rows.check_fits(arm)
 
 
 def test_refuses_positions_in_degrees():

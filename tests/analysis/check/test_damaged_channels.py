@@ -91,6 +91,13 @@ def test_detects_channels_with_all_signals_exchanged(name, pair):
     assert "all signals" in found[0].what
 
 
+def test_detects_all_efforts_inverted_or_in_reverse_order():
+    true, arm = motion("psm"), load_arm("psm")
+    for tau, what in ((-true.tau, "all efforts have the wrong sign"), (true.tau[:, ::-1], "tau are in reverse order")):
+        (found,) = check_channels(Observations(replace(true, tau=tau), arm))
+        assert found.severity == "refusal" and what in found.what
+
+
 def test_detects_exchanged_efforts_in_joint_coordinates():
     arm = load_arm("mtmr")
     damaged = exchanged(motion("mtmr").in_joint_coordinates(arm), 1, 3, "tau")

@@ -65,6 +65,15 @@ def test_finds_the_unit_of_times_of_one_moving_joint():
     assert "t may be in milliseconds: 100 Hz" in refusal.what
 
 
+@pytest.mark.parametrize("names", [("tau", "qd", "q"), ("q", "tau", "qd"), ("qd", "q", "tau")])
+def test_names_of_exchanged_quantities(names):
+    true = motion(velocities=True)
+    assert source_fault(true, ARM) is None
+    fault = source_fault(replace(true, **dict(zip(names, (true.q, true.qd, true.tau), strict=True))), ARM)
+    assert fault.kind == "exchanged quantities"
+    assert "Positions are in {}, velocities in {}, efforts in {}".format(*names) in fault.what
+
+
 @pytest.mark.parametrize("rate", [3.0, 12.0, 19.0])
 def test_slow_rates_are_named(rate):
     fault = motion_fault(motion(rate, 200.0), ARM)
