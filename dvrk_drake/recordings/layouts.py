@@ -1,4 +1,4 @@
-"""Layouts of tables whose columns have no names, most of them of one laboratory.
+"""Layouts of tables whose columns have no names, most of them of one research group.
 
 `LAYOUTS` is the table of the known layouts. Readers of CSV files and of arrays use it to name the columns.
 """

@@ -98,7 +98,7 @@ def test_predict_uses_the_coordinates_of_the_recording(folder, tmp_path, coordin
     np.testing.assert_allclose(tau, expected, atol=1e-12)
 
 
-def test_predict_of_a_psm_in_wpi_coordinates_writes_joint_coordinates(tmp_path):
+def test_predict_in_wpi_coordinates_writes_joint_coordinates(tmp_path):
     """In these coordinates, the roll is that of the joint."""
     arm = load_arm("psm")
     path, model, out = tmp_path / "poses.csv", tmp_path / "model.yaml", tmp_path / "tau.csv"

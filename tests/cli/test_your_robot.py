@@ -32,6 +32,8 @@ def test_commands_accept_a_model_file(tmp_path, monkeypatch, capsys):
     arm = dvrk.load_arm(random_robot(tmp_path, 0))
     for k in (0, 1):
         dvrk.write_recording(random_motion(arm, k), f"motion_{k}.csv")
+    q = arm.sample_poses(40, np.random.default_rng(0))
+    dvrk.write_recording(dvrk.Recording(q=q, tau=dvrk.IdentifiedModel.from_arm(arm).holding_torque(q)), "poses.csv")
     assert arm.num_joints == 3 and len(arm.tree_joint_names) == 4 and arm.frames.hand == "link_4"
     for name, content in (("study", STUDY), ("scenario", SCENARIO)):
         (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump(content))
@@ -42,11 +44,13 @@ def test_commands_accept_a_model_file(tmp_path, monkeypatch, capsys):
         "identify motion_0.csv --arm random.urdf --output model.yaml --report report.html",
         "validate motion_1.csv --model model.yaml --json validation.json",
         "predict motion_1.csv --model model.yaml --output predicted.csv",
+        "identify poses.csv --arm random.urdf --output static.yaml --report static.html",
+        "validate poses.csv --model model.yaml --report poses.html",
         "identify recalibrate motion_1.csv --model model.yaml --output today.yaml",
         "payload motion_1.csv --model model.yaml",
         "excite --arm random.urdf --static 12 --output poses.yaml",
         "excite --arm random.urdf --duration 6 --period 6 --harmonics 4 --starts 1 --output motion.yaml",
-        "simulate --arm random.yaml --set duration=0.2",
+        "simulate --arm random.yaml --set duration=0.2 --set controller.mode=guide",
         "simulate scenario.yaml --output held.csv",
         "simulate transparency --arm random.urdf --path motion_0.csv --speed 5",
         "simulate study study.yaml --output study.csv --workers 1",

@@ -122,7 +122,7 @@ def test_the_cause_of_efforts_above_the_limits_is_named(change, advice):
         check_effort_unit(replace(rows, tau=change(rows.tau)), arm)
 
 
-def test_exchanged_positions_and_efforts_without_velocities_are_named():
+def test_exchanged_positions_and_efforts_are_named():
     arm = load_arm("psm")
     rows = Recording(q=np.tile(0.9 * arm.effort_limits, (3, 1)), tau=np.tile(arm.position_upper, (3, 1)))
     with pytest.raises(RecordingError, match="if the positions and the efforts are exchanged"):
