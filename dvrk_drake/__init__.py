@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm
     from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.models.environment import Environment
+    from dvrk_drake.models.inverse_kinematics import inverse_kinematics
     from dvrk_drake.models.locked_joints import lock_joints
     from dvrk_drake.models.plant import add_arm, set_arm_positions
     from dvrk_drake.processes.arm_session import Dialog
@@ -88,6 +89,7 @@ _MODULES = {
     "estimate_force": "analysis.external_force",
     "export_model": "export.model_export",
     "identify": "analysis.identification",
+    "inverse_kinematics": "models.inverse_kinematics",
     "load_arm": "models.arm_files",
     "lock_joints": "models.locked_joints",
     "load_scenario": "experiments.scenario",
@@ -138,6 +140,7 @@ __all__ = [
     "estimate_force",
     "export_model",
     "identify",
+    "inverse_kinematics",
     "load_arm",
     "load_scenario",
     "load_station_config",

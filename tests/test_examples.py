@@ -23,6 +23,7 @@ SCRIPTS = [
     "02_gravity_of_any_robot.py",
     "05_hold.py",
     "06_guide.py",
+    "07_inverse_kinematics.py",
     "08_own_controller.py",
     "10_teleoperation.py",
     "arms_and_table.py",
