@@ -200,9 +200,12 @@ def _efforts_in_motion(model: IdentifiedModel, observations: Observations, same_
     effort = (compared.predicted - compared.measured) @ to_joints
     errors = grid.channels @ dynamics.error_covariance(other_day=not same_day) @ grid.channels.T
     errors = to_joints.T @ (errors + np.diag(~measured * UNMEASURED**2)) @ to_joints
-    bound = DryFrictionBound(dynamics, 2 * np.pi * compared.cut_off)
-    rest = np.clip(grid.filter_efforts(bound.rest(grid.at_rows(grid.v, 0))), 0.0, 1.0)
-    return compared.t, transmission.inverse.position(compared.q), effort, errors + bound.covariance(rest)
+    bound = DryFrictionBound(dynamics)
+    # At the start, the arm may have rested for any time.
+    rest, period = np.ones((len(grid.row_times), len(bound.deviation))), 1.0 / grid.rate
+    for k, v in enumerate(grid.at_rows(grid.v, 0)):
+        rest[k] = bound.rest(v, rest[max(k - 1, 0)], period)
+    return compared.t, transmission.inverse.position(compared.q), effort, errors + bound.covariance(rest[grid.inner])
 
 
 def _efforts_at_rest(model: IdentifiedModel, observations: Observations, same_day: bool) -> _Efforts:
@@ -218,7 +221,7 @@ def _efforts_at_rest(model: IdentifiedModel, observations: Observations, same_da
         covariance = np.diag(deviation**2)
     elif model.dynamics is not None:
         dynamics, J = model.dynamic_model, arm.transmission.matrix
-        bound = DryFrictionBound(dynamics, 1.0)
+        bound = DryFrictionBound(dynamics)
         covariance = J.T @ dynamics.error_covariance(other_day=not same_day) @ J
         covariance = covariance + bound.covariance(np.ones(len(bound.deviation)))
     else:

@@ -59,7 +59,7 @@ class MomentumObserver:
         self._dynamics, self._n = dynamics, arm.num_joints
         self._effects = EffectArrays.of(arm, dynamics.effects, dynamics.coefficients)
         self._is_loaded = is_loaded(dynamics.effects)
-        self._bound = DryFrictionBound(dynamics, self.bandwidth)
+        self._bound = DryFrictionBound(dynamics)
         J = arm.transmission.matrix
         self._model_covariance = J.T @ dynamics.error_covariance() @ J
         self._other_day = J.T @ dynamics.error_covariance(other_day=True) @ J
@@ -96,7 +96,7 @@ class MomentumObserver:
         advance_effects(np.concatenate([q, v]), self._effects.constants, loads, state[self._memory], friction)
         share = 1.0 - self._decay
         state[self._r] += share * (rigid + friction - tau - state[self._r])
-        state[self._rest] += share * (self._bound.rest(v) - state[self._rest])
+        state[self._rest] = self._bound.rest(v, state[self._rest], self._period)
         state[self._q] += share * (q - state[self._q])
         state[self._v] = v
 
