@@ -2,8 +2,8 @@
 
     python benchmarks/external_force.py [--arm psm] [--contacts 200] [--free-minutes 10] [--bandwidth 30] [--folder F]
 
-The simulated arm has all effects of its file: friction, springs, encoders, noise, delays. Its model is identified from one
-designed motion of 30 s. Then the arm follows another, random motion, while random forces act on its tip: 1 s each,
+The simulated arm has all effects of its file: friction, springs, encoders, noise, delays. Its model is identified from
+one designed motion of 30 s. Then the arm follows another, random motion, while random forces act on its tip: 1 s each,
 0.2 to 10 N, in random directions. Rows of the table:
 
     observer            ExternalForceEstimator with the identified model

@@ -1,11 +1,13 @@
-"""Estimates the weights on a real PSM as forces over the whole motion, with a model of the same motion without a weight.
+"""Estimates the weights on a real PSM as forces over the whole motion, with a model of the motion without a weight.
 
     python benchmarks/external_force_recordings.py FOLDER
 
-FOLDER contains psm_one_no_weight.csv, psm_one_105g_parallel.csv and psm_one_205g_insertion.csv in the coordinates "wpi",
-with a header and times (docs/public_recordings.md). The true force of a weight m is m (g - a), with the acceleration a of
-its position. The first table has the components in the frame of the link. The second one has the joint efforts, whose
-truth contains no assumption on components that cannot be measured. Ranges are those of the true values.
+FOLDER contains psm_one_no_weight.csv, psm_one_105g_parallel.csv and psm_one_205g_insertion.csv in the coordinates
+"wpi", with a header and times (docs/public_recordings.md). The model is identified from the first one, so its own errors
+are those of the fit. The true force of a weight m is m (g - a), with the acceleration a of its position. The first table
+has the components in the frame of the link that can be measured. Its truth for y is not exact: z cannot be measured, and
+is assumed to be near 0. The second table has the joint efforts, whose truth needs no such assumption. Ranges are those
+of the true values.
 """
 
 from __future__ import annotations
@@ -68,7 +70,7 @@ def main() -> int:
             np.array([in_base.jacobian(q).T @ f for q, f in zip(grid.q, weight, strict=True)]),
         )
         in_frame, at_joints = (grid.filter_efforts(grid.at_rows(truth, 0)) for truth in truths)
-        for i in range(2):
+        for i in np.flatnonzero(np.any(days[0].measurable, axis=0)):
             used, widths = days[0].measurable[:, i], [day.half_width[:, i] for day in days]
             cells = row(days[0].force[:, i] - in_frame[:, i], in_frame[:, i], widths, used)
             forces[f"{name}, {'xyz'[i]}"] = (*cells, f"{100 * np.mean(used):.0f} %")
