@@ -3,11 +3,11 @@
     python benchmarks/external_force_recordings.py FOLDER
 
 FOLDER contains psm_one_no_weight.csv, psm_one_105g_parallel.csv and psm_one_205g_insertion.csv in the coordinates
-"wpi", with a header and times (docs/public_recordings.md). The model is identified from the first one, so its own errors
-are those of the fit. The true force of a weight m is m (g - a), with the acceleration a of its position. The first table
-has the components in the frame of the link that can be measured. Its truth for y is not exact: z cannot be measured, and
-is assumed to be near 0. The second table has the joint efforts, whose truth needs no such assumption. Ranges are those
-of the true values.
+"wpi", with a header and times (docs/public_recordings.md). The model is identified from the first one, so its own
+errors are those of the fit. The true force of a weight m is m (g - a), with the acceleration a of its position. The
+first table has the components in the frame of the link that can be measured. Its truth for y is not exact, because z
+cannot be measured and is assumed to be near 0. The second table has the joint efforts, whose truth needs no such
+assumption. Ranges are those of the true values.
 """
 
 from __future__ import annotations

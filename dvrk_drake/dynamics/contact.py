@@ -14,8 +14,8 @@ from dvrk_drake.models.arm import Arm
 #: Prior standard deviation of each component of a force [N]: the largest force for which the estimates were tested
 #: (benchmarks/external_force.py). It hardly changes a component that the efforts determine to 1 N.
 PRIOR_FORCE = 10.0
-#: Largest standard deviation of a component that is reported [N], a fifth of that without a measurement. The interval is
-#: then +- 4 N, so it contains 0 for most forces that an instrument exerts.
+#: Largest standard deviation of a component that is reported [N], a fifth of that without a measurement. The interval
+#: is then +- 4 N, so it contains 0 for most forces that an instrument exerts.
 MAX_DEVIATION = 2.0
 
 #: Axes in which a force is expressed: those of the base B of the arm, or those of the frame F of the contact.
