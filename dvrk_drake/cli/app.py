@@ -226,9 +226,9 @@ class ConnectedArm:
             raise DvrkDrakeError(f"{' and '.join(given)}: only with --transport {own}")
 
     def as_text(self) -> str:
-        """Returns the options that select the arm, for another command line."""
-        names = ("arm", "transport", "lcm_url", "key", "topic", "domain")
-        values = {name: getattr(self, name) for name in names}
+        """Returns the options that select the arm and its model, for another command line."""
+        names = ("arm", "transport", "lcm_url", "key", "topic", "domain", "model")
+        values = {name: getattr(self, name, None) for name in names}
         return options_text(values | {"transport": "ros" if self.is_ros else None})
 
     def connect(self, dialog: Dialog, **settings: Any) -> ArmConnection:

@@ -21,7 +21,7 @@ from dvrk_drake.cli.app import (
     app,
     whole_number,
 )
-from dvrk_drake.cli.support import load_environment, load_key, print_line, print_warning, print_written
+from dvrk_drake.cli.support import load_environment, load_key, print_line, print_warning, print_written, suggest
 from dvrk_drake.errors import DvrkDrakeError
 
 
@@ -93,10 +93,8 @@ def calibrate(
             print_written(result.folder / file, what)
     if result.is_usable:
         model = result.folder / "model.yaml"
-        print(
-            f"In the driver's configuration of the arm: model: {model.resolve()}\n"
-            f"Next: dvrk-drake control {connected.as_text()} --model {model} --friction-ratio 0.3"
-        )
+        print_line(f"In the driver's configuration of the arm: model: {model.resolve()}")
+        suggest(f"dvrk-drake control {connected.as_text()} --model {model} --friction-ratio 0.3")
     else:
         print_warning("a joint failed the validation; look at the reports before you use the models")
 

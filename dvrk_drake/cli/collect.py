@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
@@ -15,6 +16,7 @@ from dvrk_drake.cli.support import (
     interrupt_ends_process,
     print_notes,
     print_written,
+    suggest,
 )
 from dvrk_drake.errors import CollectionError
 
@@ -53,6 +55,7 @@ def record(
     finally:
         line.clear()
     print_notes(file, notes)
+    suggest(f"dvrk-drake check {file} --arm {connected.arm}")
 
 
 @collect.command
@@ -84,6 +87,7 @@ def teach(
     finally:
         line.clear()
     print_written(poses, f"{count} poses; the guard of {connection.arm.name} regulates the pose")
+    suggest(f"dvrk-drake collect poses {poses} {controlled.as_text()} --output {Path(poses).with_suffix('.csv')}")
 
 
 @collect.command(name="poses")
@@ -142,6 +146,7 @@ def collect_poses(
         raise CollectionError(
             f"the arm did not come to rest at poses {numbers}. Run the command again to repeat these poses"
         )
+    suggest(f"dvrk-drake identify {output} --arm {controlled.arm} --output model.yaml")
 
 
 @collect.command(name="motion")
@@ -189,7 +194,10 @@ def collect_motion(
 
         parts = recorded_parts(output, connection.arm, PeriodicMotion.load(motion, connection.arm))
         files = " ".join(str(part.path) for part in useful(parts, played.duration))
-        print(f"Next: dvrk-drake identify {files} --arm {controlled.arm} --output model.yaml", flush=True)
+        suggest(f"dvrk-drake identify {files} --arm {controlled.arm} --output model.yaml")
+    else:
+        recording = Path(motion).with_suffix(".csv")
+        suggest(f"dvrk-drake collect motion {motion} {controlled.as_text()} --output {recording}")
 
 
 def _connect(controlled: ControlledArm, *, keys: bool, confirms: bool = False) -> tuple[ArmConnection, LiveLine]:

@@ -13,9 +13,11 @@ from dvrk_drake.cli.app import HARDWARE, ConnectedArm, ControlledArm, app
 from dvrk_drake.cli.support import (
     interrupt_ends_process,
     print_line,
+    print_next_step,
     print_warning,
     print_written,
     request_realtime,
+    show_page,
 )
 
 if TYPE_CHECKING:
@@ -109,7 +111,7 @@ def status(*, connected: ConnectedArm, watch: bool = False) -> None:
     """
     from dvrk_drake.processes.arm_session import Dialog
     from dvrk_drake.reports.arm_status import status_page
-    from dvrk_drake.reports.terminal import make_console, print_page
+    from dvrk_drake.reports.terminal import make_console
 
     connected.check()
     connection, console = connected.connect(Dialog(report=print_line)), make_console()
@@ -117,9 +119,10 @@ def status(*, connected: ConnectedArm, watch: bool = False) -> None:
         for observation in observations:
             if watch:
                 console.clear()
-            print_page(console, status_page(connection.arm, observation))
+            show_page(status_page(connection.arm, observation))
             if not watch:
                 return
+            print_next_step()
 
 
 @app.command(group=HARDWARE)

@@ -7,7 +7,14 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from dvrk_drake.cli.app import SIMULATE, Overwrite, Port, Seed, Verbose, app
-from dvrk_drake.cli.support import Steps, check_output, command_words, new_folder, print_written
+from dvrk_drake.cli.support import (
+    Steps,
+    check_output,
+    command_words,
+    new_folder,
+    print_written,
+    show_page,
+)
 from dvrk_drake.progress import step_progress
 
 _DEMO_STEPS = "collecting poses", "identifying", "collecting fresh poses", "simulating the release", "drawing"
@@ -33,7 +40,6 @@ def demo(
     from dvrk_drake.reports.html_file import write_html
     from dvrk_drake.reports.image_files import write_images
     from dvrk_drake.reports.provenance import Provenance
-    from dvrk_drake.reports.terminal import make_console, print_page
 
     output = new_folder(folder, overwrite=overwrite)
     with Steps(*_DEMO_STEPS) as steps:
@@ -42,7 +48,7 @@ def demo(
         page = demo_page(result, output)
         write_images(page, output)
         write_html(page, output / "report.html", Provenance.of([output / "poses.csv"], command_words))
-    print_page(make_console(), page, verbose=verbose)
+    show_page(page, verbose=verbose)
     print_written(output)
 
 
@@ -65,7 +71,6 @@ def teleop(
     from dvrk_drake.experiments.demo.teleoperation_scene import start_scene
     from dvrk_drake.models.files import atomic_write
     from dvrk_drake.reports.demo import teleoperation_page
-    from dvrk_drake.reports.terminal import make_console, print_page
     from dvrk_drake.systems.arm_view.page import page_html
 
     if output is None:
@@ -83,7 +88,7 @@ def teleop(
         result = play_teleoperation(meshcat, progress=step_progress(steps, "playing"))
     with atomic_write(output) as stream:
         stream.write(page_html(meshcat, "MTML teleoperates PSM", phases=PHASES, effort_scale=True))
-    print_page(make_console(), teleoperation_page(result, output), verbose=verbose)
+    show_page(teleoperation_page(result, output), verbose=verbose)
     print_written(output)
 
 

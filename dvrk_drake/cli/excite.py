@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -24,7 +25,7 @@ from dvrk_drake.cli.app import (
     whole_number,
     with_instrument,
 )
-from dvrk_drake.cli.support import Steps, check_output, load_environment, mounted, print_written
+from dvrk_drake.cli.support import Steps, check_output, load_environment, mounted, print_written, suggest
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.workers import local_executor
 
@@ -150,8 +151,9 @@ def excite(
         console,
         f"{moved.name}: motion of {motion.duration:g} s. Expected error of predicted efforts: "
         f"{100 * design.expected_error:.1f} % ({100 * design.random_error:.1f} % with the best random motion).",
-        f"dvrk-drake collect motion {output} --arm {arm} --rehearse",
     )
+    with_model = "" if model is None else f" --model {shlex.quote(model)}"
+    suggest("dvrk-drake collect motion " + shlex.join([output, "--arm", arm]) + f"{with_model} --rehearse")
     console.print(
         f"Base parameters known to 10 %: {design.known_parameters} of {design.num_parameters}. Condition number: "
         f"{design.condition_number:.3g}. Information per parameter (log-determinant): {design.log_determinant:.2f}."
@@ -188,8 +190,9 @@ def _select_poses(
         console,
         f"{arm.name}: {count} static poses. Expected error of predicted holding efforts: "
         f"{100 * design.expected_error:.1f} % ({100 * design.random_error:.1f} % with {count} random poses).",
-        f"dvrk-drake collect poses {output} --arm {name} --output {Path(output).with_suffix('.csv')}",
     )
+    recording = str(Path(output).with_suffix(".csv"))
+    suggest("dvrk-drake collect poses " + shlex.join([output, "--arm", name, "--output", recording]))
     console.print(f"Gravity parameters known to 10 %: {design.known_parameters} of {design.num_parameters}.")
     print_written(output)
 

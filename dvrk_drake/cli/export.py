@@ -10,7 +10,14 @@ from cyclopts import Group, Parameter
 
 from dvrk_drake.cli.app import Arm, Instrument, Model, Overwrite, Verbose, export, one_of, with_instrument
 from dvrk_drake.cli.report import ResultsAndJson
-from dvrk_drake.cli.support import Steps, check_output, load_model, print_warning, print_written
+from dvrk_drake.cli.support import (
+    Steps,
+    check_output,
+    load_model,
+    print_warning,
+    print_written,
+    show_page,
+)
 from dvrk_drake.errors import DvrkDrakeError, ModelError
 
 if TYPE_CHECKING:
@@ -79,7 +86,6 @@ def export_model(
     from dvrk_drake.export.model_export import MODEL_FORMATS, configuration_beside, prepare_export
     from dvrk_drake.export.model_writer import mesh_folder, refuse_existing_meshes, sdf_difference
     from dvrk_drake.reports.export import export_page
-    from dvrk_drake.reports.terminal import make_console, print_page
 
     requested: dict[Format, str | None] = {
         "sdf": sdf,
@@ -120,7 +126,7 @@ def export_model(
         exports[format].write(path)
     for format, path in outputs.items():
         if format != "urdf" or "sdf" not in outputs:  # both formats contain the same model
-            print_page(make_console(), export_page(path, exports[format]), verbose=verbose)
+            show_page(export_page(path, exports[format]), verbose=verbose)
     for format, path in outputs.items():
         if omitted := exports[format].omitted_shapes:
             shapes = ", ".join(f"{shape} of {link}" for link, shape in omitted)

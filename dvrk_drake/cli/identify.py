@@ -32,6 +32,7 @@ from dvrk_drake.cli.support import (
     print_notes,
     print_warnings,
     print_written,
+    show_page,
 )
 from dvrk_drake.errors import ModelError
 
@@ -261,13 +262,12 @@ def recalibrate(
     The result is valid only for similar motions, positions and speeds (docs/payload.md).
     """
     from dvrk_drake.reports.identification import recalibration_page
-    from dvrk_drake.reports.terminal import make_console, print_page
 
     check_output(output, recording, model, overwrite=overwrite)
     with Steps(*_STEPS, "refitting friction") as steps:
         result = dvrk.recalibrate(*_model_and_recording(model, recording, file, steps), progress=steps)
     result.save(output, overwrite=True)
-    print_page(make_console(), recalibration_page(result, model_path=output), verbose=verbose)
+    show_page(recalibration_page(result, model_path=output, file_options=file.as_text()), verbose=verbose)
     print_written(output)
 
 
@@ -317,7 +317,8 @@ def payload(
             print_notes(read.source, read.notes)
         reference = recordings[0] if loaded else None
         result = dvrk.payload(reference, recordings[-1], identified or recorded_arm, link, progress=steps)
-    page = payload_page(result, model_path=model)
+    options = file.as_text() + ("" if gravity is None else f" --gravity {' '.join(map(repr, gravity))}")
+    page = payload_page(result, model_path=model, options=options)
     warnings = [warning for warning in result.warnings if warning.kind == "other link"]
     results.show(page, *paths, model, content=result.as_dicts(), warnings=warnings)
 

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from dvrk_drake.cli.app import MODEL, Arm, Gravity, Instrument, LcmUrl, Overwrite, Port, app
-from dvrk_drake.cli.support import Steps, check_output, mounted, print_written, until_stopped
+from dvrk_drake.cli.support import Steps, check_output, command_again, mounted, print_written, show_page, until_stopped
 from dvrk_drake.errors import DvrkDrakeError
 
 
@@ -34,7 +34,6 @@ def equations(
     from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.models.files import atomic_write
     from dvrk_drake.reports.model import symbolic_model_page
-    from dvrk_drake.reports.terminal import make_console, print_page
 
     if output is not None:
         if format is None:
@@ -44,7 +43,7 @@ def equations(
     with Steps("deriving the gravity torque"):
         derived = derive_gravity(shown)
     if format is None:
-        print_page(make_console(), symbolic_model_page(derived))
+        show_page(symbolic_model_page(derived, command=command_again("--format", "latex")))
         return
     writers = {
         "latex": lambda: gravity_sources.to_latex(derived, SymbolicPlant(shown).frame_poses()),

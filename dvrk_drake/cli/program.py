@@ -38,7 +38,13 @@ from dvrk_drake.cli import (
     simulated_arm,
 )
 from dvrk_drake.cli.app import app
-from dvrk_drake.cli.support import command_words, folders_only_for_results, import_interruptibly
+from dvrk_drake.cli.support import (
+    command_words,
+    folders_only_for_results,
+    import_interruptibly,
+    print_next_step,
+    suggest,
+)
 from dvrk_drake.errors import DvrkDrakeError
 
 # The matrices are small. Several BLAS threads would mostly wait for each other: minutes on a busy computer.
@@ -103,7 +109,11 @@ def run(arguments: Sequence[str] | None) -> int:
             signal.signal(signal.SIGINT, signal.default_int_handler)
         with folders_only_for_results(), warnings.catch_warnings():
             warnings.showwarning = _print_warning
-            command(*bound.args, **bound.kwargs)
+            suggest("")
+            try:
+                command(*bound.args, **bound.kwargs)
+            finally:
+                print_next_step()
     except DvrkDrakeError as error:
         print(f"dvrk-drake: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2

@@ -28,6 +28,7 @@ from dvrk_drake.cli.support import (
     new_folder,
     print_notes,
     print_written,
+    suggest,
 )
 from dvrk_drake.errors import ModelError, RecordingError
 
@@ -54,7 +55,7 @@ def samples(folder: str, /, *, overwrite: Overwrite = False) -> None:
         files = dvrk.write_samples(target, overwrite=True, progress=steps)
     for file in files:
         print_written(file)
-    print(f"Next: dvrk-drake check {files[0]} --arm {SAMPLES[files[0].stem]}")
+    suggest(f"dvrk-drake check {files[0]} --arm {SAMPLES[files[0].stem]}")
 
 
 @app.command(group=IDENTIFY)

@@ -19,6 +19,7 @@ from dvrk_drake.cli.support import (
     plots_folder,
     print_warnings,
     print_written,
+    show_page,
     write_json,
 )
 from dvrk_drake.errors import DvrkDrakeError
@@ -81,13 +82,13 @@ class Results:
             warnings: Warnings to print.
             saved: Path of an output that was written already. None: there is none.
         """
-        from dvrk_drake.reports.terminal import make_console, print_page
+        from dvrk_drake.reports.terminal import make_console
 
         # Results are saved before printing, because the reader of the output (e.g. head) may close the pipe.
         if self._json is not None:
             write_json(self._json, content)
+        show_page(page, verbose=self.verbose)
         console = make_console()
-        print_page(console, page, verbose=self.verbose)
         if note:
             console.print(note)
         print_warnings(console, warnings)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -10,7 +12,7 @@ from cyclopts import Parameter
 import dvrk_drake as dvrk
 from dvrk_drake.cli.app import Arm, FileOptions, Set, one_of, simulate, whole_number
 from dvrk_drake.cli.report import Results
-from dvrk_drake.cli.support import Steps, check_output, until_stopped
+from dvrk_drake.cli.support import Steps, check_output, command_again, until_stopped
 from dvrk_drake.errors import ScenarioError, StudyError
 from dvrk_drake.progress import step_progress
 
@@ -54,7 +56,7 @@ def simulate_scenario(
         print(f"{loaded.mounted_arm.name} at {page.web_url()}", flush=True)
     with Steps("simulating") as steps:
         simulation = dvrk.simulate(loaded, meshcat=page, progress=steps)
-    argument = (scenario or f"--arm {arm}") if results.plots is None else None
+    argument = (scenario or f"--arm {arm}") + _set_options(set) if results.plots is None else None
     if output is not None:
         dvrk.write_recording(simulation.recording, output, loaded.mounted_arm, simulation.setpoints)
     result = simulation_page(simulation, loaded.mounted_arm, scenario=argument)
@@ -62,6 +64,11 @@ def simulate_scenario(
     if page is not None:
         print("the page can replay the motion; press Stop, Escape or Ctrl-C to end", flush=True)
         until_stopped(page)
+
+
+def _set_options(values: Sequence[str] | None) -> str:
+    """Returns the options --set for a command line, beginning with a space, or ""."""
+    return "".join(f" --set {shlex.quote(value)}" for value in values or ())
 
 
 def _check_workers(_: object, value: int | None) -> None:
@@ -110,7 +117,7 @@ def study(
         else:
             with dask_executor(scheduler) as executor:
                 rows = run_study(loaded, executor, output, show)
-    page = study_page(loaded, rows, study_path=study if results.plots is None else None)
+    page = study_page(loaded, rows, study_path=study + _set_options(set) if results.plots is None else None)
     results.show(page, study, output, saved=output)
 
 
@@ -209,4 +216,4 @@ def transparency(
             )
     if output is not None:
         write_transparency(Path(output), forces)
-    results.show(transparency_page(moved_arm, forces), path, *(model or []), saved=output)
+    results.show(transparency_page(moved_arm, forces, command=command_again()), path, *(model or []), saved=output)

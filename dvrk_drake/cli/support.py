@@ -7,6 +7,7 @@ import json
 import logging
 import math
 import os
+import shlex
 import signal
 import sys
 import tempfile
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm
     from dvrk_drake.models.environment import Environment
     from dvrk_drake.models.lcm_messages import MessageKey
+    from dvrk_drake.reports.page import Page
     from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 
 
@@ -133,6 +135,8 @@ MAX_BARS = 6
 command_words: list[str] = []
 #: Paths of the outputs of the running command.
 _outputs: set[Path] = set()
+#: Next step after the running command.
+_next_step = [""]
 #: Folders that the running command created. Each folder precedes its parent.
 _made: list[Path] = []
 
@@ -170,6 +174,31 @@ def plots_folder(path: str | None, *, overwrite: bool) -> Path | None:
 def print_written(path: str | Path, what: str = "") -> None:
     """Prints the path of a file or folder that was written, followed by the description `what`."""
     print(f"wrote {path}{what and ': '}{what}", flush=True)
+
+
+def command_again(*words: str) -> str:
+    """Returns the command line of the running command with further words."""
+    return shlex.join(["dvrk-drake", *command_words, *words])
+
+
+def suggest(next_step: str) -> None:
+    """Stores the next step, usually a command, which is printed after the command. "": there is none."""
+    _next_step[0] = next_step
+
+
+def print_next_step() -> None:
+    """Prints the next step. The line is not wrapped, so that a user can copy it."""
+    if _next_step[0]:
+        print_line(f"Next: {_next_step[0]}")
+    suggest("")
+
+
+def show_page(page: Page, *, verbose: bool = False) -> None:
+    """Prints a page, and stores its next step."""
+    from dvrk_drake.reports.terminal import make_console, print_page
+
+    print_page(make_console(), page, verbose=verbose)
+    suggest(page.next_step)
 
 
 def print_line(line: str) -> None:

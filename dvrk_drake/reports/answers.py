@@ -82,13 +82,13 @@ def _after_identification(
         return command, f"{how} the direction of gravity, because the base seems to be tilted."
     if worst(verdicts)[0] == "do not use":
         return _check(result.recording, result.model.arm, file_options)
-    return _validate_other(model_path)
+    return _validate_other(model_path, file_options)
 
 
 def _after_validation(validation: Validation, model_path: str, file_options: str, saved: bool) -> tuple[str, str]:
     arm, source = validation.model.arm, source_argument(validation.recording, file_options)
     if validation.of_same_recording:
-        return _validate_other(model_path)
+        return _validate_other(model_path, file_options)
     if validation.verdict == "do not use":
         # Errors above 100 % are due to wrong signs, units or coordinates, which a refit of friction does not correct.
         plausible = all(error is None or error <= 1 for error in validation.relative_errors.values())
@@ -99,8 +99,8 @@ def _after_validation(validation: Validation, model_path: str, file_options: str
     if not saved:
         replaces = " --overwrite" if validation.model.validation is not None else ""
         command = f"dvrk-drake validate {source} --model {model_path} --save{replaces}"
-        return command, "Store the verdicts in the model file, from which the command run reads them."
-    if arm.locked_joints:  # run requires all joints
+        return command, "Store the verdicts in the model file, from which the command control reads them."
+    if arm.locked_joints:  # control requires all joints
         command = f"dvrk-drake predict {source} --model {model_path} --output FILE.csv"
         return command, "Predict the efforts of a recording of these joints."
     command = f"dvrk-drake control --arm {arm.source} --model {model_path} --mode damped"
@@ -112,8 +112,8 @@ def _check(recording: Recording, arm: Arm, file_options: str) -> tuple[str, str]
     return command, "Check the recording for wrong units, signs, channels and joints at a stop."
 
 
-def _validate_other(model_path: str) -> tuple[str, str]:
-    command = f"dvrk-drake validate OTHER.csv --model {model_path} --save"
+def _validate_other(model_path: str, file_options: str) -> tuple[str, str]:
+    command = f"dvrk-drake validate OTHER.csv{file_options} --model {model_path} --save"
     return command, "Evaluate the model on a recording that was not used for the identification."
 
 

@@ -409,12 +409,13 @@ def _data_quality(result: Result, efforts: Efforts) -> list[Block]:
     return blocks
 
 
-def recalibration_page(result: Recalibration, *, model_path: str = "MODEL.yaml") -> Page:
+def recalibration_page(result: Recalibration, *, model_path: str = "MODEL.yaml", file_options: str = "") -> Page:
     """Returns the errors before and after the refit, and the change of friction and offsets.
 
     Args:
         result: Result of the recalibration.
         model_path: Path of the new model, for the suggested next command.
+        file_options: Options with which the recording was read, beginning with a space, for the suggested next command.
     """
     before, after = (float(np.mean([getattr(a, which) for a in result.actuators])) for which in ("before", "after"))
     rows = []
@@ -447,7 +448,7 @@ def recalibration_page(result: Recalibration, *, model_path: str = "MODEL.yaml")
         f"{kept} of {len(result.actuators)} actuators refitted.",
         [Section("Errors", blocks)],
         "good",
-        f"dvrk-drake validate OTHER.csv --model {model_path} --save",
+        f"dvrk-drake validate OTHER.csv{file_options} --model {model_path} --save",
     )
 
 

@@ -6,8 +6,13 @@ from dvrk_drake.dynamics.symbolic_gravity import SymbolicGravity
 from dvrk_drake.reports.page import Page, Section, Table
 
 
-def symbolic_model_page(gravity: SymbolicGravity) -> Page:
-    """Returns the base parameters of gravity with their nominal values from the SDF, and the joint limits."""
+def symbolic_model_page(gravity: SymbolicGravity, *, command: str = "") -> Page:
+    """Returns the base parameters of gravity with their nominal values from the SDF, and the joint limits.
+
+    Args:
+        gravity: Symbolic gravity.
+        command: Suggested next command. "": there is none.
+    """
     arm, base = gravity.arm, gravity.base
     parameters = [
         (name, f"{value:+.5f}", unit)
@@ -34,5 +39,5 @@ def symbolic_model_page(gravity: SymbolicGravity) -> Page:
             Section("Joint limits", [Table(("", "position", "effort"), limits, caption, show="details")]),
         ],
         "good",
-        f"dvrk-drake equations --arm {arm.source} --format latex",
+        command,
     )

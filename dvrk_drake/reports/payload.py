@@ -18,13 +18,14 @@ from dvrk_drake.reports.page import Block, Page, Plot, Section, Table, Text
 from dvrk_drake.reports.plot import Dots, Style, category_panel
 
 
-def payload_page(result: PayloadIdentification, *, model_path: str | None = None) -> Page:
+def payload_page(result: PayloadIdentification, *, model_path: str | None = None, options: str = "") -> Page:
     """Returns the page of an estimated payload.
 
     Args:
         result: Result of `dvrk_drake.payload`.
         model_path: Path of the model, for the suggested next command. None if the model was identified from the
             reference recording.
+        options: Further options of the command, beginning with a space, for the suggested next command.
     """
     payload, estimates = result.payload, result.estimates
     others = equally_good_links(estimates) if result.link is None else better_links(payload, estimates)
@@ -59,7 +60,7 @@ def payload_page(result: PayloadIdentification, *, model_path: str | None = None
             *([Section("Efforts", [_effort_plot(payload), _effort_table(payload)])] if payload.found else []),
         ],
         "good" if clear else "warning",
-        f"dvrk-drake payload {files} {source} " + ("--json FILE" if clear else "--link LINK"),
+        f"dvrk-drake payload {files} {source}{options} " + ("--json FILE" if clear else "--link LINK"),
     )
 
 

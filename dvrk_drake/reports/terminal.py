@@ -1,4 +1,4 @@
-"""Prints pages to a terminal: the answer and the next step, then texts and tables of at most 80 columns."""
+"""Prints pages to a terminal: the answer, then texts and tables of at most 80 columns."""
 
 from __future__ import annotations
 
@@ -76,14 +76,14 @@ def make_console() -> Console:
 
 
 def print_page(console: Console, page: Page, *, verbose: bool = False) -> None:
-    """Prints the answer and the next step, then the texts and tables.
+    """Prints the answer, then the texts and tables. A command prints the next step as its last line.
 
     Args:
         console: Console to print to.
         page: Page to print.
         verbose: Whether to print the details.
     """
-    print_answer(console, page.answer, page.next_step, page.level)
+    print_answer(console, page.answer, page.level)
     shown: tuple[Show, ...] = ("always", "details") if verbose else ("always", "brief")
     blocks = [block for block in page.blocks if isinstance(block, Text | Table) and block.show in shown]
     for before, block in zip([None, *blocks], blocks, strict=False):
@@ -104,19 +104,15 @@ def print_page(console: Console, page: Page, *, verbose: bool = False) -> None:
         console.print()
 
 
-def print_answer(console: Console, answer: str, next_step: str, level: Level = "good") -> None:
-    """Prints the result of a command and the suggested next step, then an empty line.
+def print_answer(console: Console, answer: str, level: Level = "good") -> None:
+    """Prints the result of a command, then an empty line.
 
     Args:
         console: Console to print to.
         answer: Result in one or two sentences.
-        next_step: Next step, usually a command. The line is not wrapped, so that a user can copy the command. "" if
-            there is no next step.
         level: Level of the answer.
     """
     console.print(answer, style=_STYLES[level], markup=False)
-    if next_step:
-        console.print(f"Next: {next_step}", markup=False, soft_wrap=True)
     console.print()
 
 

@@ -15,12 +15,13 @@ from dvrk_drake.reports.page import Page, Plot, Section, Table, Text
 from dvrk_drake.reports.plot import Curve, Panel, series
 
 
-def transparency_page(arm: Arm, forces: Sequence[OperatorForces]) -> Page:
+def transparency_page(arm: Arm, forces: Sequence[OperatorForces], *, command: str = "") -> Page:
     """Returns the page of simulated interaction forces.
 
     Args:
         arm: Simulated arm.
         forces: One result per compensation. The first is without compensation.
+        command: Command line that simulated them, for the suggested next command. "": there is none.
     """
     best, without = min(forces, key=lambda one: one.rms_force), forces[0]
     answer = f"Smallest interaction force at the handle: {best.rms_force:.2f} N RMS with {best.name}"
@@ -35,7 +36,7 @@ def transparency_page(arm: Arm, forces: Sequence[OperatorForces]) -> Page:
         answer,
         [Section("Interaction force and torque", [forces_table(arm, forces), note, forces_plot(forces)])],
         "good",
-        f"dvrk-drake simulate transparency --arm {arm.source} --model MODEL.yaml --plots FOLDER",
+        f"{command} --model MODEL.yaml" if command else "",
     )
 
 

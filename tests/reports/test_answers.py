@@ -2,6 +2,7 @@
 
 import os
 import re
+import shlex
 import tempfile
 from dataclasses import replace
 from functools import cache
@@ -14,6 +15,7 @@ from loaded_arm import two_days
 from report_results import operator_forces, study_results, tuning_result
 
 import dvrk_drake as dvrk
+from dvrk_drake.cli.program import app
 from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
 from dvrk_drake.experiments.demo.demo import DemoResult
 from dvrk_drake.experiments.demo.teleoperation import TeleoperationResult
@@ -24,12 +26,13 @@ from dvrk_drake.reports import (
     export,
     recording_check,
     simulation,
+    terminal,
 )
 from dvrk_drake.reports.identification import identification_page, recalibration_page
 from dvrk_drake.reports.model import symbolic_model_page
 from dvrk_drake.reports.payload import payload_page
 from dvrk_drake.reports.study import study_page
-from dvrk_drake.reports.terminal import TABLE_WIDTH, TableConsole, print_page
+from dvrk_drake.reports.terminal import TABLE_WIDTH, TableConsole
 from dvrk_drake.reports.transparency import transparency_page
 from dvrk_drake.reports.tuning import tuning_page
 
@@ -120,6 +123,14 @@ def demonstrated(console, verbose):
     print_page(console, demo.demo_page(result, Path("demo_output")), verbose=verbose)
 
 
+NEXT_STEPS = []
+
+
+def print_page(console, page, *, verbose=False):
+    NEXT_STEPS.append(page.next_step)
+    terminal.print_page(console, page, verbose=verbose)
+
+
 VERDICT = r"Verdict: (good|usable|do not use) ?[(.]"
 #: Mapping from a case to a pattern for the start of the answer, and the function that prints it.
 CASES = {
@@ -208,11 +219,13 @@ def printed(case, verbose):
 def test_answer_comes_first_and_output_fits_80_columns(case):
     short, whole = printed(case, False), printed(case, True)
     for text in (short, whole):
-        answer, _, rest = text.partition("\nNext: ")
+        answer, _, _ = text.partition("\n\n")
         assert re.match(CASES[case][0], " ".join(answer.split())), text
-        assert answer.count("\n") < 3 and rest.split("\n")[1] == ""
-        # Findings are not wrapped, so that they can be searched, nor commands, so that they can be copied.
-        lines = [line for line in text.splitlines() if not line.startswith(("warning: ", "note: ", "Next: "))]
+        assert answer.count("\n") < 3
+        # Findings are not wrapped, so that they can be searched.
+        lines = [line for line in text.splitlines() if not line.startswith(("warning: ", "note: "))]
         assert max(len(line.rstrip()) for line in lines) <= 80, text
         assert "…" not in text
     assert whole.startswith(short.split("\n\n")[0]) and len(whole) >= len(short)
+    if (step := NEXT_STEPS.pop()).startswith("dvrk-drake "):
+        app.parse_args(shlex.split(step)[1:], print_error=False, exit_on_error=False)
