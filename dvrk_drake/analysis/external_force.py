@@ -201,11 +201,12 @@ def _efforts_in_motion(model: IdentifiedModel, observations: Observations, same_
     errors = grid.channels @ dynamics.error_covariance(other_day=not same_day) @ grid.channels.T
     errors = to_joints.T @ (errors + np.diag(~measured * UNMEASURED**2)) @ to_joints
     bound = DryFrictionBound(dynamics)
-    # At the start, the arm may have rested for any time.
-    rest, period = np.ones((len(grid.row_times), len(bound.deviation))), 1.0 / grid.rate
-    for k, v in enumerate(grid.at_rows(grid.v, 0)):
-        rest[k] = bound.rest(v, rest[max(k - 1, 0)], period)
-    return compared.t, transmission.inverse.position(compared.q), effort, errors + bound.covariance(rest[grid.inner])
+    states, state = [], bound.start()
+    for q, v in zip(grid.at_rows(grid.q, 0), grid.at_rows(grid.v, 0), strict=True):
+        bound.update(state, q, v, 1.0 / grid.rate)
+        states.append(state.copy())
+    covariance = errors + bound.covariance(np.array(states)[grid.inner])
+    return compared.t, transmission.inverse.position(compared.q), effort, covariance
 
 
 def _efforts_at_rest(model: IdentifiedModel, observations: Observations, same_day: bool) -> _Efforts:
@@ -223,7 +224,7 @@ def _efforts_at_rest(model: IdentifiedModel, observations: Observations, same_da
         dynamics, J = model.dynamic_model, arm.transmission.matrix
         bound = DryFrictionBound(dynamics)
         covariance = J.T @ dynamics.error_covariance(other_day=not same_day) @ J
-        covariance = covariance + bound.covariance(np.ones(len(bound.deviation)))
+        covariance = covariance + bound.covariance(bound.start())
     else:
         raise ModelError("the model states no errors, so the force has no interval; use a model from identify")
     covariance = covariance + np.diag(~poses.measured_joints(arm) * UNMEASURED**2)

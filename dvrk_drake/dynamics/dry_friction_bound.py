@@ -1,4 +1,4 @@
-"""Bounds the dry friction of joints at rest, where the model does not determine it."""
+"""Bounds the dry friction of an arm where the model does not determine it: at rest, and at the start of a motion."""
 
 from __future__ import annotations
 
@@ -15,15 +15,18 @@ REST_TIME = 0.25
 
 
 class DryFrictionBound:
-    """Standard deviation of the dry friction along the coordinates of an arm's drive, by their velocity.
+    """Standard deviation of the dry friction along the coordinates of an arm's drive.
 
     While a coordinate moves, or turns back, the model determines its dry friction. At rest, friction balances any
-    effort between minus and plus the sum of its coefficients. The standard deviation is that of a uniform distribution
-    in these bounds.
+    effort between minus and plus the sum of its coefficients. At the start, the deflection of a presliding element is
+    unknown, until the coordinate has moved over twice its presliding travel. The standard deviation is that of a
+    uniform distribution in these bounds.
+
+    A state (3 c) has three numbers for each of c coordinates: how long it has rested, from 0 in motion to 1 after
+    several times `REST_TIME`, then its smallest and its largest position since the start.
 
     Attributes:
-        rows: Matrix (c, n) that maps joint velocities to the velocities of the coordinates with dry friction.
-        deviation: Standard deviations (c,) at rest [N m, N].
+        rows: Matrix (c, n) that maps joint positions to the positions of the coordinates with dry friction.
     """
 
     def __init__(self, dynamics: DynamicModel) -> None:
@@ -32,36 +35,45 @@ class DryFrictionBound:
         A coordinate rests if it travels less than its smallest presliding travel in `REST_TIME`. Without presliding
         elements, it rests below the smallest speed at which the model has its full friction.
         """
-        bounds: dict[str, float] = {}
-        speeds: dict[str, list[tuple[bool, float]]] = {}
-        for effect, coefficient in zip(dynamics.effects, dynamics.coefficients, strict=True):
-            if EFFECT_KINDS[effect.kind].symmetric and coefficient:
-                bounds[effect.coordinate] = bounds.get(effect.coordinate, 0.0) + coefficient
-                is_speed = effect.kind != "presliding"
-                speed = effect.scale if is_speed else effect.scale / REST_TIME
-                speeds.setdefault(effect.coordinate, []).append((is_speed, speed))
+        dry = [
+            (effect, coefficient)
+            for effect, coefficient in zip(dynamics.effects, dynamics.coefficients, strict=True)
+            if EFFECT_KINDS[effect.kind].symmetric and coefficient
+        ]
+        names = list(dict.fromkeys(effect.coordinate for effect, _ in dry))
         n = dynamics.arm.num_joints
-        self.rows = np.array([joint_row(dynamics.arm, name) for name in bounds]).reshape(-1, n)
-        self.deviation = np.array(list(bounds.values())) / np.sqrt(3.0)
-        # Presliding travels precede speeds in the order of the tuples.
-        self._speeds = np.array([min(values)[1] for values in speeds.values()])
+        self.rows = np.array([joint_row(dynamics.arm, name) for name in names]).reshape(-1, n)
+        has_state = np.array([effect.kind == "presliding" for effect, _ in dry], bool)
+        scales = np.array([effect.scale for effect, _ in dry])
+        of_coordinate = np.array([[effect.coordinate == name for effect, _ in dry] for name in names], bool)
+        self._speeds = np.array(
+            [
+                np.min(scales[own & has_state]) / REST_TIME if np.any(own & has_state) else np.min(scales[own])
+                for own in of_coordinate
+            ]
+        )
+        self._deviations = of_coordinate * np.array([c for _, c in dry]) / np.sqrt(3.0)
+        self._wiped = 2.0 * scales * has_state
 
-    def rest(self, v: NDArray[np.float64], before: NDArray[np.float64], period: float) -> NDArray[np.float64]:
-        """Returns how long each coordinate has rested (c,), from 0 in motion to 1 after several times `REST_TIME`.
+    def start(self) -> NDArray[np.float64]:
+        """Returns the state (3 c) of an arm that may have rested for any time."""
+        one = np.ones(len(self.rows))
+        return np.concatenate([one, np.inf * one, -np.inf * one])
 
-        Args:
-            v: Velocities (n,) of the joints [rad/s, m/s].
-            before: Result (c,) at the previous sample; ones for an arm that rested before.
-            period: Time since the previous sample [s].
-        """
+    def update(self, state: NDArray[np.float64], q: NDArray[np.float64], v: NDArray[np.float64], period: float) -> None:
+        """Updates a state in place with the positions q and velocities v (n,) of the joints after a period [s]."""
+        rest, low, high = state.reshape(3, -1)  # views
+        x = self.rows @ q
         still = 1.0 - np.tanh(self.rows @ v / self._speeds) ** 2
-        return np.minimum(still, before + period / REST_TIME * (1.0 - before))
+        rest[:] = np.minimum(still, rest + min(period / REST_TIME, 1.0) * (1.0 - rest))
+        np.minimum(low, x, out=low)
+        np.maximum(high, x, out=high)
 
-    def covariance(self, rest: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns the covariances (..., n, n) of the joint efforts [(N m)^2, N^2].
-
-        Args:
-            rest: Results (..., c) of `rest`.
-        """
-        scaled = (rest * self.deviation)[..., None] * self.rows
+    def covariance(self, states: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Returns the covariances (..., n, n) of the joint efforts [(N m)^2, N^2] for states (..., 3 c)."""
+        rest, low, high = np.split(states, 3, axis=-1)
+        # Elements with a known deflection count at rest, the others always.
+        is_unknown = (high - low)[..., None] < self._wiped
+        deviation = np.sum(self._deviations * np.where(is_unknown, 1.0, rest[..., None]), axis=-1)
+        scaled = deviation[..., None] * self.rows
         return np.asarray(scaled.swapaxes(-1, -2) @ scaled)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -63,21 +65,25 @@ class MomentumObserver:
         J = arm.transmission.matrix
         self._model_covariance = J.T @ dynamics.error_covariance() @ J
         self._other_day = J.T @ dynamics.error_covariance(other_day=True) @ J
-        self._decay = np.exp(-self.bandwidth * self._period)
-        sizes = [self._n, len(self._bound.deviation), self._n, self._n, self._effects.size]
+        sizes = [self._n, len(self._bound.start()), self._n, self._n, self._effects.size]
         ends = np.cumsum(sizes)
-        self._r, self._rest, self._q, self._v, self._memory = map(slice, [0, *ends[:-1]], ends)
+        self._r, self._dry, self._q, self._v, self._memory = map(slice, [0, *ends[:-1]], ends)
         self.size = int(ends[-1])
 
     def start(self) -> NDArray[np.float64]:
         """Returns the state (size,) before the first measurement: no external effort, and friction as at rest."""
         state = np.zeros(self.size)
-        state[self._rest] = 1.0
+        state[self._dry] = self._bound.start()
         state[self._v] = np.nan
         return state
 
     def update(
-        self, state: NDArray[np.float64], q: NDArray[np.float64], v: NDArray[np.float64], tau: NDArray[np.float64]
+        self,
+        state: NDArray[np.float64],
+        q: NDArray[np.float64],
+        v: NDArray[np.float64],
+        tau: NDArray[np.float64],
+        period: float | None = None,
     ) -> None:
         """Updates the state in place with a measurement.
 
@@ -85,18 +91,20 @@ class MomentumObserver:
             state: State (size,).
             q, v: Positions [rad, m] and velocities (n,) of the joints.
             tau: Efforts (n,) of the motors at the joints [N m, N].
+            period: Time since the previous measurement [s]. None: the period of the observer.
         """
         if np.isnan(state[self._v][0]):
             state[self._q], state[self._v] = q, v
-        vd = (v - state[self._v]) / self._period
+        period = period or self._period
+        vd = (v - state[self._v]) / period
         regressor = self._dynamics.regressor
         rigid = regressor.torque(q[None], v[None], vd[None], self._dynamics.parameters)[0]
         loads = self._loads(q, v, vd) if self._is_loaded else self._effects.no_loads
         friction = np.empty(self._n)
         advance_effects(np.concatenate([q, v]), self._effects.constants, loads, state[self._memory], friction)
-        share = 1.0 - self._decay
+        share = 1.0 - math.exp(-self.bandwidth * period)
         state[self._r] += share * (rigid + friction - tau - state[self._r])
-        state[self._rest] = self._bound.rest(v, state[self._rest], self._period)
+        self._bound.update(state[self._dry], q, v, period)
         state[self._q] += share * (q - state[self._q])
         state[self._v] = v
 
@@ -111,14 +119,38 @@ class MomentumObserver:
     def covariance(self, state: NDArray[np.float64], *, other_day: bool = True) -> NDArray[np.float64]:
         """Returns the covariance (n, n) of the external joint efforts.
 
-        It contains the errors of the model on held-out motions, and the dry friction of joints at rest.
+        It contains the errors of the model on held-out motions, and the dry friction that the model does not determine.
 
         Args:
             state: State (size,).
             other_day: True to include the assumed change of the efforts between days.
         """
         errors = self._other_day if other_day else self._model_covariance
-        return errors + self._bound.covariance(state[self._rest])
+        return errors + self._bound.covariance(state[self._dry])
+
+    def significance(self, state: NDArray[np.float64], *, other_day: bool = True) -> float:
+        """Returns r' C^-1 r for the external effort r with the covariance C, see `threshold`."""
+        r = state[self._r]
+        return float(r @ np.linalg.solve(self.covariance(state, other_day=other_day), r))
+
+    def threshold(self, false_alarms_per_hour: float) -> float:
+        """Returns the `significance` that an arm without contact exceeds at the given rate.
+
+        It is a quantile of the chi-squared distribution with n degrees of freedom. The low-pass makes w / 2 values per
+        second independent. The errors of a model are not exactly normal, so benchmarks/external_force.py measures the
+        rate.
+
+        Args:
+            false_alarms_per_hour: Expected number of false alarms per hour, from 1e-6 to 1000.
+
+        Raises:
+            ControllerError: The rate is out of range.
+        """
+        if not 1e-6 <= false_alarms_per_hour <= 1000:
+            raise ControllerError(f"false alarms per hour must be from 1e-6 to 1000; got {false_alarms_per_hour:g}")
+        from scipy.special import chdtri  # takes 0.1 s, and most programs detect no contacts
+
+        return float(chdtri(self._n, false_alarms_per_hour / (1800.0 * self.bandwidth)))
 
     def _loads(self, q: NDArray[np.float64], v: NDArray[np.float64], vd: NDArray[np.float64]) -> NDArray[np.float64]:
         return self._effects.loads(self._dynamics.transmitted_effort(q[None], v[None], vd[None])[0])

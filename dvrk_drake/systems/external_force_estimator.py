@@ -31,6 +31,7 @@ class ExternalForceEstimator(LeafSystem):
         - force
         - force_covariance
         - measurable
+        - contact
         - fault
 
     Ports, for n joints in the arm's order and k components of the force (see `Contact`) [rad, rad/s, N m; m, m/s, N on
@@ -43,6 +44,8 @@ class ExternalForceEstimator(LeafSystem):
     - `force` (k): force on the arm at the point of contact [N]. It assumes that nothing else touches the arm.
     - `force_covariance` (k^2): its covariance, row by row [N^2].
     - `measurable` (k): 1 for each component that the arm can measure at its pose, else 0. Do not use the others.
+    - `contact` (1): 1 while the external effort is significant, i.e. larger than the errors of the model at the stated
+      rate of false alarms, else 0. It detects a contact at any point of the arm.
     - `fault` (1): 1 while an input is not finite or implausibly large, else 0.
 
     **Delay.** The estimate is a first-order low-pass of the force with the bandwidth w, so it is late by about 1 / w.
@@ -73,6 +76,7 @@ class ExternalForceEstimator(LeafSystem):
         contact: Contact | None = None,
         bandwidth: float = 30.0,
         same_day: bool = False,
+        false_alarms_per_hour: float = 1.0,
         period: float = 1e-3,
     ) -> None:
         """Creates the estimator for the model's arm.
@@ -83,12 +87,14 @@ class ExternalForceEstimator(LeafSystem):
             bandwidth: Bandwidth w of the observer [rad/s].
             same_day: True if the model was identified on the same day. By default, the covariance contains the assumed
                 change of the efforts between days.
+            false_alarms_per_hour: Expected rate of false alarms of the output `contact`, see
+                `MomentumObserver.threshold`.
             period: Period of the update [s].
 
         Raises:
             ModelError: The model has no dynamics, or does not state its errors.
             ArmError: The arm has locked joints, or `contact` belongs to another arm.
-            ControllerError: Bandwidth or period is out of range.
+            ControllerError: Bandwidth, period or rate of false alarms is out of range.
         """
         super().__init__()
         arm = model.arm
@@ -98,6 +104,7 @@ class ExternalForceEstimator(LeafSystem):
             raise ArmError(f"contact has {self._contact.num_joints} joints; allowed: {arm.num_joints}")
         self._observer = MomentumObserver(model, bandwidth=bandwidth, period=period)
         self._observer.covariance(self._observer.start(), other_day=not same_day)
+        self._threshold = self._observer.threshold(false_alarms_per_hour)
         self._other_day = not same_day
         n, k = arm.num_joints, len(self._contact.components)
         self._n, self._k = n, k
@@ -106,12 +113,13 @@ class ExternalForceEstimator(LeafSystem):
         # State of the observer, then 1 if it is valid.
         self._memory = self.DeclareDiscreteState(self._observer.size + 1)
         ticket = {self.discrete_state_ticket(self._memory)}
-        allocate = ValueProducer(lambda: AbstractValue.Make((np.zeros(k),) * 3), self._calc_contact)
-        self._of_contact = self.DeclareCacheEntry("contact", allocate, ticket)
+        allocate = ValueProducer(lambda: AbstractValue.Make((np.zeros(k),) * 3), self._calc_force)
+        self._of_contact = self.DeclareCacheEntry("force and covariance", allocate, ticket)
         self.DeclareVectorOutputPort("external_effort", n, self._calc_effort, ticket)
         self.DeclareVectorOutputPort("effort_covariance", n * n, self._calc_effort_covariance, ticket)
         for i, (name, size) in enumerate((("force", k), ("force_covariance", k * k), ("measurable", k))):
             self.DeclareVectorOutputPort(name, size, self._make_calc(i), {self._of_contact.ticket()})
+        self.DeclareVectorOutputPort("contact", 1, self._calc_contact, ticket)
         self.DeclareVectorOutputPort("fault", 1, self._calc_fault, ticket)
         self.DeclareInitializationDiscreteUpdateEvent(self._restart)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
@@ -152,7 +160,7 @@ class ExternalForceEstimator(LeafSystem):
         estimate = self._effort(context)
         output.SetFromVector(np.zeros(self._n**2) if estimate is None else estimate[2].ravel())
 
-    def _calc_contact(self, context: Context, value: AbstractValue) -> None:
+    def _calc_force(self, context: Context, value: AbstractValue) -> None:
         """Computes the force (k,), its covariance (k, k), and 1 or 0 for each component that is measurable (k,)."""
         estimate = self._effort(context)
         if estimate is None:
@@ -160,6 +168,12 @@ class ExternalForceEstimator(LeafSystem):
             return
         force, covariance = (x[0] for x in self._contact.force(*(x[None] for x in estimate)))
         value.set_value((force, covariance, is_measurable(covariance).astype(float)))
+
+    def _calc_contact(self, context: Context, output: BasicVector) -> None:
+        memory = context.get_discrete_state(int(self._memory)).get_value()
+        is_valid = memory[-1] == 1.0
+        found = is_valid and self._observer.significance(memory[:-1], other_day=self._other_day) > self._threshold
+        output.SetAtIndex(0, float(found))
 
     def _make_calc(self, part: int) -> Callable[[Context, BasicVector], None]:
         """Returns the function that outputs one part of the cached force at the contact."""

@@ -85,6 +85,17 @@ def test_interval_contains_zero_without_a_force(resting):
     assert np.all(np.abs(force) < 1.96 * np.sqrt(np.diag(covariance.reshape(3, 3))))
 
 
+def test_contact_is_detected_at_the_stated_rate(pushed, resting):
+    system = ExternalForceEstimator(pushed[0])
+    assert read(system, run(system, pushed[1]), "contact")[0] == 1
+    assert read(system, run(system, resting[1]), "contact")[0] == 0
+    # Independent normal errors exceed the threshold at the stated rate.
+    observer, generator = MomentumObserver(pushed[0], bandwidth=20.0), np.random.default_rng(0)
+    rate = 0.01 * 3600 * observer.bandwidth / 2
+    alarms = np.sum(generator.normal(size=(100_000, 7)) ** 2, axis=1) > observer.threshold(rate / 100)
+    np.testing.assert_allclose(np.mean(alarms), 1e-4, atol=5e-5)
+
+
 def test_fault_restarts_the_estimate(pushed):
     model, recording = pushed
     system = ExternalForceEstimator(model)
@@ -126,6 +137,11 @@ def test_invalid_arguments_give_one_line(pushed):
             lambda: ExternalForceEstimator(IdentifiedModel.from_arm(PSM, dynamics=True)),
         ),
         (ControllerError, "bandwidth between 0 and 1 / period", lambda: ExternalForceEstimator(model, bandwidth=-1)),
+        (
+            ControllerError,
+            "false alarms per hour must be",
+            lambda: ExternalForceEstimator(model, false_alarms_per_hour=0.0),
+        ),
         (ArmError, 'no frame "tip"', lambda: Contact(PSM, "tip")),
         (ArmError, "direction is 0", lambda: Contact(PSM, direction=[0, 0, 0])),
         (ArmError, "point is", lambda: Contact(PSM, point=[0, np.nan, 0])),
