@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from typing import Annotated
 
 from cyclopts import Parameter
@@ -26,7 +25,6 @@ def sim_arm(
     effects: Annotated[list[str] | None, Parameter(metavar="NAME ..", consume_multiple=True)] = None,
     realtime: Realtime = False,
     driver: Annotated[str | None, Parameter(metavar="FILE.yaml")] = None,
-    meshcat: Annotated[bool, Parameter(show_default=False)] = False,
     rate: Annotated[float | None, Parameter(metavar="HZ")] = None,
     model: Model | None = None,
     enabled: Annotated[bool, Parameter(show_default=False)] = False,
@@ -39,13 +37,11 @@ def sim_arm(
         pose: Initial joint positions [rad; m if prismatic]. Default: near zero, within the joint limits.
         effects: Simulated effects, e.g. friction, or all (docs/simulated_effects.md). Default: none.
         driver: LCM: configuration file of the driver (docs/lcm.md). Default: the default configuration.
-        meshcat: LCM: show the arm in a web browser.
         rate: ROS 2: rate of the measurements [Hz]. Default: 1000.
         model: ROS 2: model file for the gravity compensation. Default: the nominal model from the SDF.
         enabled: ROS 2: enable and home the arm at the start.
     """
     from dvrk_drake.models.arm_files import load_arm
-    from dvrk_drake.processes.live_view import live_view
     from dvrk_drake.processes.pace import settle_memory
     from dvrk_drake.processes.simulated_arm import SimulatedArm, start_pose, stop_on_signals
     from dvrk_drake.processes.simulated_ros_arm import SimulatedRosArm
@@ -53,7 +49,7 @@ def sim_arm(
     from dvrk_drake.systems.ros.crtk_driver import CrtkDriver
     from dvrk_drake.systems.ros.open_domain import domain_number
 
-    connected.check(lcm={"driver": driver, "meshcat": meshcat}, ros={"rate": rate, "model": model, "enabled": enabled})
+    connected.check(lcm={"driver": driver}, ros={"rate": rate, "model": model, "enabled": enabled})
     arm = mounted(load_arm(connected.arm), gravity)
     simulated_effects = None if effects is None else arm.effects.only(effects)
     start = start_pose(arm, pose, simulated_effects)
@@ -73,10 +69,9 @@ def sim_arm(
         else:
             simulated = SimulatedArm(arm, configuration, configuration.lcm_url, start, effects=simulated_effects)
         stopped = stop_on_signals()
-    with live_view(connected.arm, configuration.lcm_url) if meshcat else nullcontext():
-        settle_memory()
-        if not connected.is_ros:
-            request_realtime(realtime)
-        print_line(f"simulated {arm.name} on {simulated.source}; press Ctrl-C to end")
-        pace = simulated.run(stopped, print_line, EnterKey.of_terminal())
+    settle_memory()
+    if not connected.is_ros:
+        request_realtime(realtime)
+    print_line(f"simulated {arm.name} on {simulated.source}; press Ctrl-C to end")
+    pace = simulated.run(stopped, print_line, EnterKey.of_terminal())
     print_line(f"ended; {pace.describe()}")

@@ -2,13 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
-import signal
-import subprocess
-import sys
-from collections.abc import Iterator
-
 import numpy as np
 
 from dvrk_drake.errors import ControllerError
@@ -35,29 +28,3 @@ def show_status(view: ArmView, link: ArmLink) -> None:
         desired = commanded if np.all(np.isfinite(commanded)) else None
         view.show(status.position, effort=status.effort_measured, desired=desired)
         view.overlay.set_state(describe_state(status.guard_state))
-
-
-# The function `prctl` is looked up before the fork, because few operations are safe after a fork.
-_prctl = getattr(ctypes.CDLL(None), "prctl", None)
-_PR_SET_PDEATHSIG = 1
-
-
-def _end_with_parent() -> None:
-    if _prctl is not None:
-        _prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-
-
-@contextlib.contextmanager
-def live_view(arm: str, url: str) -> Iterator[subprocess.Popen]:
-    """Runs `dvrk-drake view --live` for an arm (name or path) in a process that ends with the `with` block.
-
-    A separate process is required because drawing would delay a loop at 1 kHz. On Linux, the process also ends if the
-    parent process is killed.
-    """
-    command = [sys.executable, "-m", "dvrk_drake.cli", "view", "--arm", arm, "--live", "--lcm-url", url]
-    viewer = subprocess.Popen(command, preexec_fn=_end_with_parent)  # noqa: PLW1509
-    try:
-        yield viewer
-    finally:
-        viewer.terminate()
-        viewer.wait()

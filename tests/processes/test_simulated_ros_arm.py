@@ -228,7 +228,7 @@ def test_psm_has_separate_topics_for_the_jaw(monkeypatch):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--transport", "ros", "--meshcat"], "error: --meshcat: only with --transport lcm"),
+        (["--transport", "ros", "--driver", "d.yaml"], "error: --driver: only with --transport lcm"),
         (["--rate", "500"], "error: --rate: only with --transport ros"),
         (["--transport", "ros", "--rate", "5000"], "rate is 5000; allowed: 10..1000 Hz"),
         (["--transport", "ros", "--domain", "300"], "ROS domain 300: allowed: 0 to 232 (--domain, or ROS_DOMAIN_ID)"),
