@@ -17,7 +17,7 @@ from dvrk_drake.analysis.observations.excluded_measurements import (
 from dvrk_drake.analysis.results import JudgedError, Validation
 from dvrk_drake.analysis.verdict import NEGLIGIBLE, coverage, judge, rule_text, tolerances
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.recordings.recording import Coordinates, Recording
+from dvrk_drake.recordings.recording import FileCoordinates, Recording, file_transmission
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,7 +86,7 @@ class StaticValidation(Validation):
 
 
 def predict_static(
-    model: IdentifiedModel, recording: Recording, coordinates: Coordinates | None = None
+    model: IdentifiedModel, recording: Recording, coordinates: FileCoordinates | None = None
 ) -> NDArray[np.float64]:
     """Returns the predicted holding torques (m, n) at the poses of a recording [N m, N].
 
@@ -101,10 +101,8 @@ def predict_static(
     arm = model.arm
     recording.check_fits(arm)
     tau = model.holding_torque(recording.in_joint_coordinates(arm).q)
-    if (coordinates or recording.coordinates) == "actuator":
-        # tau_joint = J' tau_actuator, so the inverse map transforms efforts from joints to actuators.
-        tau = arm.transmission.inverse.pull_back_effort(tau)
-    return tau
+    # tau_joint = J' tau_file, so the inverse map transforms efforts from joints to the coordinates of the file.
+    return file_transmission(arm, coordinates or recording.coordinates).inverse.pull_back_effort(tau)
 
 
 def validate_static(model: IdentifiedModel, recording: Recording) -> StaticValidation:

@@ -22,7 +22,7 @@ from dvrk_drake.analysis.verdict import unexplained_effort
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.progress import Progress, step_progress
-from dvrk_drake.recordings.recording import MAX_PERIOD, MIN_ROWS, Coordinates, Recording
+from dvrk_drake.recordings.recording import MAX_PERIOD, MIN_ROWS, FileCoordinates, Recording, file_transmission
 
 
 def validate(
@@ -95,7 +95,7 @@ def predict(
     model: IdentifiedModel,
     recording: Recording,
     *,
-    coordinates: Coordinates | None = None,
+    coordinates: FileCoordinates | None = None,
     progress: Progress | None = None,
 ) -> Prediction:
     """Predicts the efforts at the rows of a recording, as `dvrk-drake predict` does.
@@ -103,7 +103,7 @@ def predict(
     Args:
         model: Model from `identify` or `IdentifiedModel.load`.
         recording: Poses or a motion. Efforts are not required.
-        coordinates: Coordinates of the result: "joint" or "actuator". Default: those of the recording.
+        coordinates: Coordinates of the result: "joint", "actuator" or "wpi". Default: those of the recording.
         progress: Callback that receives the name of the step ("checking the recording" or "predicting") and the
             finished share of the step (0 to 1).
 
@@ -136,11 +136,8 @@ def predict(
     report = require_usable(observations, progress, ignored_kind="no effort" if recording.tau is None else "")
     share = step_progress(progress, "predicting")
     share(0.0)
-    tau = predict_motion(model, observations)
-    to_actuator = np.eye(arm.num_joints)
-    if (coordinates or recording.coordinates) == "joint":
-        to_actuator = arm.transmission.matrix
-        tau = tau @ to_actuator
+    to_actuator = arm.transmission.matrix @ file_transmission(arm, coordinates or recording.coordinates).inverse.matrix
+    tau = predict_motion(model, observations) @ to_actuator
     widths = [model.dynamic_model.combined_half_width(to_actuator.T, other_day=day) for day in (False, True)]
     same_day, other_day = (width if np.all(width > 0) else None for width in widths)
     share(1.0)

@@ -222,10 +222,10 @@ def predict(
     In all other cases, the command predicts the holding efforts.
 
     Args:
-        output: CSV file to write, with columns tau1..taun [N m; N if prismatic] in the coordinates of the recording
-            (joint for wpi). For a motion, it also contains the time t, and the columns lower1..lowern and
-            upper1..uppern are the limits of the 95 % prediction interval. The columns lower_other_day1..n and
-            upper_other_day1..n are those on another day than that of the model's recording.
+        output: CSV file to write, with columns tau1..taun [N m; N if prismatic] in the coordinates of the recording.
+            For a motion, it also contains the time t, and the columns lower1..lowern and upper1..uppern are the limits
+            of the 95 % prediction interval. The columns lower_other_day1..n and upper_other_day1..n are those on
+            another day than that of the model's recording.
     """
     from dvrk_drake.recordings.writer_csv import write_csv
     from dvrk_drake.reports.terminal import make_console
@@ -233,15 +233,16 @@ def predict(
     check_output(output, recording, model, overwrite=overwrite)
     with Steps(*_STEPS, "predicting") as steps:
         loaded, read = _model_and_recording(model, recording, file, steps)
-        prediction = dvrk.predict(loaded, read, progress=steps)
+        coordinates = read.file_coordinates or read.coordinates
+        prediction = dvrk.predict(loaded, read, coordinates=coordinates, progress=steps)
     columns = {} if read.t is None else {"t": read.t}
     columns["tau"] = tau = prediction.tau
     for suffix, width in (("", prediction.half_width), ("_other_day", prediction.half_width_other_day)):
         if width is not None:
             columns |= {f"lower{suffix}": tau - width, f"upper{suffix}": tau + width}
-    write_csv(output, columns, loaded.arm, {"coordinates": read.coordinates, "arm": loaded.arm.name})
+    write_csv(output, columns, loaded.arm, {"coordinates": coordinates, "arm": loaded.arm.name})
     print_warnings(make_console(), prediction.warnings)
-    print_written(output, f"{len(tau)} rows, {read.coordinates} coordinates")
+    print_written(output, f"{len(tau)} rows, {coordinates} coordinates")
     if prediction.half_width is not None:
         print(loaded.interval_scope, flush=True)
 

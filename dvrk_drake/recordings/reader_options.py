@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import open_input
-from dvrk_drake.recordings.recording import FileCoordinates, Recording, wpi_transmission
+from dvrk_drake.recordings.recording import FileCoordinates, Recording, file_transmission
 
 #: Number of joints of a file that is read without an arm.
 _DEFAULT_JOINTS = 7
@@ -149,7 +149,7 @@ class FileOptions:
         recording = dataclasses.replace(recording, file_coordinates=coordinates)
         if coordinates != "wpi":
             return dataclasses.replace(recording, coordinates=coordinates or "joint")
-        return recording.mapped(wpi_transmission(self.required_arm(path)).inverse, "joint")
+        return recording.mapped(file_transmission(self.required_arm(path), "wpi").inverse, "joint")
 
 
 def sha256_of(*paths: Path) -> str:

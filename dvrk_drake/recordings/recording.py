@@ -348,7 +348,7 @@ class Recording:
         """Returns other values of `--coordinates` that move all poses of the file within the limits."""
         if self.coordinates != "joint" or self._originals or self.file_coordinates:
             return []
-        transmissions = {"wpi": wpi_transmission(arm), "actuator": arm.transmission}
+        transmissions = {"wpi": file_transmission(arm, "wpi"), "actuator": arm.transmission}
         if np.array_equal(transmissions["wpi"].matrix, arm.transmission.matrix):
             del transmissions["wpi"]
         return [
@@ -400,8 +400,12 @@ class Setpoints:
     tau: NDArray[np.float64] | None = None
 
 
-def wpi_transmission(arm: Arm) -> LinearMap:
-    """Returns the map from joint coordinates to the coordinates "wpi" of a file."""
+def file_transmission(arm: Arm, coordinates: FileCoordinates) -> LinearMap:
+    """Returns the map from joint coordinates to the coordinates of a file."""
+    if coordinates == "actuator":
+        return arm.transmission
+    if coordinates == "joint":
+        return LinearMap(np.eye(arm.num_joints), np.zeros(arm.num_joints))
     J = arm.transmission.matrix.copy()
     for joint in set(_WPI_DIRECT_JOINTS) & set(arm.joint_names):
         row = arm.joint_names.index(joint)
