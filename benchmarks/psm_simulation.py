@@ -1,14 +1,14 @@
-"""Compares the computing times of simulations of the PSM: with closed loops, and as an open tree.
+"""Compares the computing times of simulations of a PSM or an ECM: with closed loops, and as an open tree.
 
-    python benchmarks/psm_simulation.py [--json FILE] [--repetitions N] [--seconds S]
+    python benchmarks/psm_simulation.py [--arm psm] [--json FILE] [--repetitions N] [--seconds S]
 
 In all controlled rows a GravityPidController at 1 kHz moves all joints along the same smooth motion. Times are CPU
 times of this process. The repetitions of the rows alternate, and ratios are medians over the repetitions.
 
 Rows:
-    open         Reference without constraints: the seven joints in series. There is no linkage and no counterweight,
-                 the end link is hinged on the yaw link at the remote centre, and both fingers are one body. The
-                 controller's gravity model is that of the arm with the linkage.
+    open         Reference without constraints: the joints in series. There is no linkage and no counterweight, the
+                 end link is hinged on the yaw link at the remote centre, and both fingers are one body. The gravity
+                 model of the controller is that of the arm with the linkage.
     ball         ArmStation with both loops closed by ball constraints; SAP with a time step of 1 ms.
     mimic        ArmStation as a tree with coupled joints; SAP with a time step of 1 ms.
     cenic_mimic  Continuous plant with coupled joints and Drake's error-controlled integrator CENIC, accuracy 1e-4.
@@ -56,44 +56,47 @@ from dvrk_drake.systems.arm_drive import add_arm_drive
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
-ARM = load_arm("psm")
-N = ARM.num_joints
 
-
-def motion(seconds: float) -> PiecewisePolynomial:
+def motion(arm: Arm, seconds: float, share: float) -> PiecewisePolynomial:
     """Returns a motion between two opposite poses of the joint box, with 0.5 s per direction."""
-    center, half = (ARM.position_lower + ARM.position_upper) / 2, (ARM.position_upper - ARM.position_lower) / 2
+    center, half = (arm.position_lower + arm.position_upper) / 2, (arm.position_upper - arm.position_lower) / 2
     times = np.arange(0.0, seconds + 0.6, 0.5)
-    knots = [center + 0.2 * (-1) ** i * half for i in range(len(times))]
-    return PiecewisePolynomial.CubicHermite(times, np.array(knots).T, np.zeros((N, len(times))))
+    knots = [center + share * (-1) ** i * half for i in range(len(times))]
+    return PiecewisePolynomial.CubicHermite(times, np.array(knots).T, np.zeros((arm.num_joints, len(times))))
 
 
-def open_arm(folder: Path) -> Arm:
-    """Returns the PSM without linkage; writes its SDF into `folder`."""
-    root = compose_sdf(ARM.sdf)
+def open_arm(arm: Arm, folder: Path) -> Arm:
+    """Returns the arm without linkage; writes its SDF into `folder`."""
+    root = compose_sdf(arm.sdf)
     model = root.find("model")
     joints = {joint.get("name"): joint for joint in model.findall("joint")}
+    (center,) = (frame for frame in model.findall("frame") if frame.get("name") == "remote_center")
     joints["pitch"].find("child").text = "end_link"
-    ElementTree.SubElement(joints["pitch"], "pose").text = "0 0.042998 -0.143705 0 0 0"
-    joints["finger_1"].set("type", "fixed")
-    joints["finger_1"].remove(joints["finger_1"].find("axis"))
-    joints["finger_1"].remove(joints["finger_1"].find(f"{DRAKE}mimic"))
-    linkage = ("bottom_bar", "top_bar", "front_crank", "end", "counterweight")
-    gone = {f"{name}_link" for name in (*linkage, "back_crank")} - {"end_link"}
+    ElementTree.SubElement(joints["pitch"], "pose").text = center.findtext("pose")
+    if "finger_1" in joints:
+        joints["finger_1"].set("type", "fixed")
+        joints["finger_1"].remove(joints["finger_1"].find("axis"))
+        joints["finger_1"].remove(joints["finger_1"].find(f"{DRAKE}mimic"))
+    kept = {"base_link"}
+    for _ in joints:  # links that the remaining joints carry
+        serial = [joints[name] for name in (*arm.joint_names, "finger_1") if name in joints]
+        kept |= {joint.findtext("child") for joint in serial if joint.findtext("parent") in kept}
     for element in list(model):
-        if element.get("name") in {*linkage, *gone} or element.get("attached_to") in gone:
+        moved = element.findtext("child") if element.tag == "joint" else element.get("attached_to", element.get("name"))
+        linkage = element.tag == "joint" and element.get("name") not in (*arm.joint_names, "finger_1")
+        if element.tag in ("link", "joint", "frame") and (moved not in kept or linkage):
             model.remove(element)
     for group in model.findall(f"{DRAKE}collision_filter_group"):
         for member in group.findall(f"{DRAKE}member"):
-            if member.text in gone:
+            if member.text not in kept:
                 group.remove(member)
     path = folder / "open.sdf"
     ElementTree.ElementTree(root).write(path)
     return dataclasses.replace(
-        ARM,
+        arm,
         sdf=(str(path),),
-        tree_joint_names=ARM.joint_names,
-        linkage=LinearMap(np.eye(N), np.zeros(N)),
+        tree_joint_names=arm.joint_names,
+        linkage=LinearMap(np.eye(arm.num_joints), np.zeros(arm.num_joints)),
         loop_closures=(),
     )
 
@@ -101,12 +104,14 @@ def open_arm(folder: Path) -> Arm:
 class StationRow:
     """ArmStation with a controller."""
 
-    def __init__(self, trajectory: PiecewisePolynomial, plant_arm: Arm, closure: str):
+    def __init__(self, arm: Arm, trajectory: PiecewisePolynomial, plant_arm: Arm, closure: str):
+        self.arm = arm
         builder = DiagramBuilder()
-        self.station = builder.AddSystem(ArmStation(ARM, plant_arm=plant_arm, closure=closure))
+        self.station = builder.AddSystem(ArmStation(arm, plant_arm=plant_arm, closure=closure))
         self.plant = self.station.plant
-        state, command = self.station.GetOutputPort("psm.state_estimated"), "psm.effort_commanded"
-        add_control(builder, trajectory, state, self.station.GetInputPort(command))
+        name = arm.name.lower()
+        state, command = self.station.GetOutputPort(f"{name}.state_estimated"), f"{name}.effort_commanded"
+        add_control(builder, arm, trajectory, state, self.station.GetInputPort(command))
         self.diagram = builder.Build()
         self.simulator = Simulator(self.diagram)
 
@@ -115,7 +120,7 @@ class StationRow:
         self.station.SetPositions(self.station.GetMyMutableContextFromRoot(root), q)
 
     def get_positions(self, root: Context) -> np.ndarray:
-        """Returns the positions (7,) of the independent joints."""
+        """Returns the positions (n,) of the independent joints."""
         return self.station.GetPositions(self.station.GetMyContextFromRoot(root))
 
 
@@ -123,15 +128,21 @@ class CenicRow:
     """Continuous plant with CENIC, with or without a controller."""
 
     def __init__(
-        self, trajectory: PiecewisePolynomial, closure: str, controlled: bool = True, fixed_step: bool = False
+        self,
+        arm: Arm,
+        trajectory: PiecewisePolynomial,
+        closure: str,
+        controlled: bool = True,
+        fixed_step: bool = False,
     ):
+        self.arm = arm
         builder = DiagramBuilder()
         self.plant, _ = AddMultibodyPlantSceneGraph(builder, time_step=0.0)
-        instance = add_arm(self.plant, ARM, closure=closure)
+        instance = add_arm(self.plant, arm, closure=closure)
         self.plant.Finalize()
-        drive = add_arm_drive(builder, self.plant, ARM, instance)
+        drive = add_arm_drive(builder, self.plant, arm, instance)
         if controlled:
-            add_control(builder, trajectory, drive.state_estimated, drive.effort_commanded)
+            add_control(builder, arm, trajectory, drive.state_estimated, drive.effort_commanded)
         self.diagram = builder.Build()
         self.simulator = Simulator(self.diagram)
         ResetIntegratorFromFlags(self.simulator, "cenic", 0.1)
@@ -143,16 +154,16 @@ class CenicRow:
 
     def set_start(self, root: Context, q: np.ndarray) -> None:
         """Sets the arm to the pose q (n,) with zero velocities."""
-        set_arm_positions(self.plant, self.plant.GetMyMutableContextFromRoot(root), ARM, q)
+        set_arm_positions(self.plant, self.plant.GetMyMutableContextFromRoot(root), self.arm, q)
 
     def get_positions(self, root: Context) -> np.ndarray:
-        """Returns the positions (7,) of the independent joints."""
+        """Returns the positions (n,) of the independent joints."""
         context = self.plant.GetMyContextFromRoot(root)
-        return np.array([self.plant.GetJointByName(name).GetOnePosition(context) for name in ARM.joint_names])
+        return np.array([self.plant.GetJointByName(name).GetOnePosition(context) for name in self.arm.joint_names])
 
 
-def add_control(builder: DiagramBuilder, trajectory: PiecewisePolynomial, state, command) -> None:
-    controller = builder.AddSystem(GravityPidController(IdentifiedModel.from_arm(ARM)))
+def add_control(builder: DiagramBuilder, arm: Arm, trajectory: PiecewisePolynomial, state, command) -> None:
+    controller = builder.AddSystem(GravityPidController(IdentifiedModel.from_arm(arm)))
     desired = builder.AddSystem(TrajectorySource(trajectory, output_derivative_order=1))
     builder.Connect(state, controller.GetInputPort("state_estimated"))
     builder.Connect(desired.get_output_port(), controller.GetInputPort("desired_state"))
@@ -189,7 +200,7 @@ def closure_errors(row: StationRow | CenicRow, seconds: float) -> tuple[float, f
         def place(frame: str, context: Context = context) -> np.ndarray:
             return plant.GetFrameByName(frame).CalcPoseInWorld(context).translation()
 
-        for loop in ARM.loop_closures:
+        for loop in row.arm.loop_closures:
             pins = max(pins, float(np.linalg.norm(place(loop.frame_a) - place(loop.frame_b))))
         centre = max(centre, float(np.linalg.norm(place("remote_center"))))
     return pins, centre
@@ -197,24 +208,27 @@ def closure_errors(row: StationRow | CenicRow, seconds: float) -> tuple[float, f
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--arm", default="psm", help="psm, psm_si, ecm or ecm_si; default: %(default)s")
+    parser.add_argument("--share", type=float, default=0.2, help="amplitude / range of a joint; default: %(default)s")
     parser.add_argument("--json", metavar="FILE", help="write the results to this file")
     parser.add_argument("--repetitions", type=int, default=11, help="number of repetitions; default: %(default)s")
     parser.add_argument("--seconds", type=float, default=1.0, help="simulated time of one repetition [s]")
     arguments = parser.parse_args()
-    trajectory = motion(arguments.seconds)
+    arm = load_arm(arguments.arm)
+    trajectory = motion(arm, arguments.seconds, arguments.share)
     start, end = (trajectory.value(time)[:, 0] for time in (0.0, arguments.seconds))
     rows: dict[str, StationRow | CenicRow] = {}
     omitted: dict[str, str] = {}
     with tempfile.TemporaryDirectory() as folder:
         makers = {
-            "open": lambda: StationRow(trajectory, open_arm(Path(folder)), "mimic"),
-            "ball": lambda: StationRow(trajectory, ARM, "ball"),
-            "mimic": lambda: StationRow(trajectory, ARM, "mimic"),
-            "cenic_mimic": lambda: CenicRow(trajectory, "mimic"),
-            "cenic_ball": lambda: CenicRow(trajectory, "ball"),
-            "fixed_mimic": lambda: CenicRow(trajectory, "mimic", fixed_step=True),
-            "fixed_ball": lambda: CenicRow(trajectory, "ball", fixed_step=True),
-            "free_mimic": lambda: CenicRow(trajectory, "mimic", controlled=False),
+            "open": lambda: StationRow(arm, trajectory, open_arm(arm, Path(folder)), "mimic"),
+            "ball": lambda: StationRow(arm, trajectory, arm, "ball"),
+            "mimic": lambda: StationRow(arm, trajectory, arm, "mimic"),
+            "cenic_mimic": lambda: CenicRow(arm, trajectory, "mimic"),
+            "cenic_ball": lambda: CenicRow(arm, trajectory, "ball"),
+            "fixed_mimic": lambda: CenicRow(arm, trajectory, "mimic", fixed_step=True),
+            "fixed_ball": lambda: CenicRow(arm, trajectory, "ball", fixed_step=True),
+            "free_mimic": lambda: CenicRow(arm, trajectory, "mimic", controlled=False),
         }
         for name, make in makers.items():
             try:
@@ -230,7 +244,7 @@ def main() -> None:
         steps[name] = steps_per_second(row, start, arguments.seconds)
         if name not in ("open", "free_mimic"):
             off = np.abs(row.get_positions(row.simulator.get_context()) - end)
-            assert np.all(off < ARM.per_joint(0.02, 0.002)), f"Row {name} did not reach the end pose; errors: {off}"
+            assert np.all(off < arm.per_joint(0.02, 0.002)), f"Row {name} did not reach the end pose; errors: {off}"
             restart(row, start)
             errors[name] = closure_errors(row, arguments.seconds)
     for name in ("ball", "mimic"):
@@ -244,7 +258,7 @@ def main() -> None:
     us = {name: 1e3 * float(np.median(values)) / arguments.seconds for name, values in times.items()}
     ratio = {name: median_ratio(times, name, "open") for name in rows}
     print_table(
-        f"PSM, drake {version('drake')}: CPU time per simulated ms, median of {arguments.repetitions} repetitions",
+        f"{arguments.arm}, drake {version('drake')}: CPU time per simulated ms, median of {arguments.repetitions} runs",
         ["time [us]", "real-time factor", "ratio to open", "steps per s", "closure [m]", "remote centre [m]"],
         {
             name: (

@@ -41,6 +41,8 @@ _ROUNDING = 1e-5
 _SHAFT, _SHAFT_MASS, _WRIST_MASS, _FINGER_MASS, _DISC_MASS = 0.4162, 0.0125, 0.0125, 0.0105, 1e-4
 #: Radius of the shaft of the large needle driver, and size of a finger [m].
 _RADIUS, _FINGER = 0.0042, (0.0031, 0.004, 0.012)
+#: Size of the housing of the large needle driver, and its centre relative to the last frame of the arm [m].
+_HOUSING, _HOUSING_CENTER = (0.052, 0.0305, 0.086), np.array([0.0, 0.00725, 0.0032])
 #: Largest effort of a jaw that a file gives no effort, because nothing moves (cautery) [N m]: that of the large needle
 #: driver. Each joint of an arm needs an effort limit, and the fourth disc exists.
 _JAW_EFFORT = 0.16
@@ -212,6 +214,7 @@ def tool_sdf(path: Path, arm: ElementTree.Element | None) -> ElementTree.Element
             X = RigidTransform(X.rotation(), X.translation() + p)
     root = ElementTree.Element("sdf", version="1.9")
     writer = _Writer(ElementTree.SubElement(root, "model", name=path.stem.lower().replace("-", "_")))
+    writer.housing(parent, X)
     efforts, limits = [*tool.efforts, tool.jaw[2] or _JAW_EFFORT], [*([-x, x] for x in tool.limits), tool.jaw[:2]]
     driven = {
         name: (
@@ -278,10 +281,15 @@ class _Writer:
         inertia = UnitInertia.SolidCylinder(_RADIUS, length, np.array([0.0, 0.0, 1.0]))
         link = self._link(name, X, mass, p_LC, inertia)
         # Short links end before the next one, and the disc of a snake-like wrist is inside the shaft.
-        values = {"radius": _RADIUS, "length": 0.9 * length}
+        values = {"radius": _RADIUS, "length": length if name == "roll" else 0.9 * length}
         if not name.endswith("_disc"):
             self._shapes(link, "cylinder", values, RigidTransform(p_LC))
         self._joint(joint, parent, name, X.rotation().col(2), driven, mimic, limit_factor)
+
+    def housing(self, carrier: str, X: RigidTransform) -> None:
+        """Adds the housing in front of the last frame of the arm to the link that carries it, which has the mass."""
+        link = ElementTree.SubElement(self._model, "link", name=carrier)
+        self._shapes(link, "box", {"size": _HOUSING}, RigidTransform(X.translation() + _HOUSING_CENTER))
 
     def finger(
         self, name: str, X: RigidTransform, R_tool: RotationMatrix, side: float, parent: str, joint: str, **kind: Any
@@ -310,7 +318,7 @@ class _Writer:
 
     def _shapes(self, link: ElementTree.Element, shape: str, values: dict[str, Any], X: RigidTransform) -> None:
         for tag in ("visual", "collision"):
-            part = ElementTree.SubElement(link, tag, name=f"{shape}_{tag}")
+            part = ElementTree.SubElement(link, tag, name=f"{self._model.get('name')}_{shape}_{tag}")
             add_pose(part, X)
             element = ElementTree.SubElement(ElementTree.SubElement(part, "geometry"), shape)
             for key, value in values.items():
