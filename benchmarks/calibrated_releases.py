@@ -19,22 +19,88 @@ from __future__ import annotations
 import argparse
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
+from pydrake.systems.primitives import LogVectorOutput
+from pydrake.trajectories import PiecewisePolynomial
 from timing import print_table
 
 import dvrk_drake as dvrk
-from dvrk_drake.experiments.reproduction.drift_experiment import BAND, DURATION, Drifts, Release, release_all
+from dvrk_drake.experiments.releases import BAND, DURATION, SAMPLE_PERIOD, approach_start, release
+from dvrk_drake.experiments.simulation import samples
 
 APPROACHES = {"none": "at rest", "regulated": "after an approach", "hand": "after a hand"}
+
+#: Duration of the motion that a hand leads, and rest before it lets go [s].
+HAND_TIME, HAND_REST = 3.0, 0.5
+
+#: Ratios of the stiffness and damping of a hand that leads an arm to the gains of the arm. The hand follows its path
+#: within about 0.01 rad against the friction of the arm, and a larger damping would be unstable at 1 kHz.
+HAND_STIFFNESS, HAND_DAMPING = 10.0, 3.0
 
 #: Factor of the base parameters in the wrong model.
 WRONG = 1.2
 
 #: Encoder counts by which a held joint may move. The controller does not notice a smaller motion in time.
 COUNTS = 5.0
+
+
+class JointHand(LeafSystem):
+    """Hand that leads each joint of an arm along a trajectory with a spring and a damper, and lets go at a time [s]."""
+
+    def __init__(self, arm, trajectory, release_time):
+        super().__init__()
+        self._trajectory, self._velocity = trajectory, trajectory.MakeDerivative()
+        self._stiffness, self._damping = HAND_STIFFNESS * np.array(arm.gains.kp), HAND_DAMPING * np.array(arm.gains.kd)
+        self._release_time = release_time
+        self.DeclareVectorInputPort("state_estimated", 2 * arm.num_joints)
+        self.DeclareVectorOutputPort("effort_disturbance", arm.num_joints, self._calc_effort)
+
+    def _calc_effort(self, context, output):
+        time = min(context.get_time(), self._trajectory.end_time())
+        if context.get_time() >= self._release_time:
+            output.SetZero()
+            return
+        q, v = np.split(self.get_input_port().Eval(context), 2)
+        error, error_rate = self._trajectory.value(time).ravel() - q, self._velocity.value(time).ravel() - v
+        output.SetFromVector(self._stiffness * error + self._damping * error_rate)
+
+
+def release_by_hand(arm, model, pose, mode, duration, seed):
+    """Simulates a hand that leads the arm to a pose and lets go; returns the positions (samples, n) after that."""
+    name, release_time = arm.name.lower(), HAND_TIME + HAND_REST
+    knots = np.column_stack([approach_start(arm, pose, seed), pose])
+    trajectory = PiecewisePolynomial.CubicHermite([0.0, HAND_TIME], knots, np.zeros_like(knots))
+    builder = DiagramBuilder()
+    station = dvrk.ArmStation(arm, effects=arm.effects, seed=seed)
+    dvrk.add_closed_loop(builder, station, dvrk.GravityPidController(model, mode=mode))
+    hand = builder.AddSystem(JointHand(arm, trajectory, release_time))
+    builder.Connect(station.GetOutputPort(f"{name}.state_true"), hand.get_input_port())
+    builder.Connect(hand.get_output_port(), station.GetInputPort(f"{name}.effort_disturbance"))
+    log = LogVectorOutput(station.GetOutputPort(f"{name}.state_true"), builder, SAMPLE_PERIOD)
+    simulator = Simulator(builder.Build())
+    station.SetPositions(station.GetMyMutableContextFromRoot(simulator.get_mutable_context()), knots[:, 0])
+    simulator.AdvanceTo(release_time + duration)
+    return samples(log, simulator)[round(release_time / SAMPLE_PERIOD) :, : arm.num_joints]
+
+
+def one_release(arm, path, pose, mode, approach, duration, seed):
+    """Returns the positions (samples, n) of an arm with the model file `path` after a release."""
+    model = load_model(path)
+    if approach == "hand":
+        return release_by_hand(arm, model, pose, mode, duration, seed)
+    return release(arm, model, pose, mode=mode, approach=approach == "regulated", duration=duration, seed=seed)
+
+
+@cache
+def load_model(path):
+    """Returns the model of a file. Each process reads it once."""
+    return dvrk.IdentifiedModel.load(path)
 
 
 def with_error(model, true, factor, q):
@@ -81,11 +147,10 @@ def main() -> None:
             path = (Path(folder) if name in ("exact", "wrong") else options.calibration) / f"{name}.yaml"
             for mode in options.modes:
                 for approach in options.approaches:
-                    case = Release(arm.name.lower(), arm, ("all",), str(path), poses[0], mode, approach)
-                    case = replace(case, duration=options.duration)
-                    cases = [replace(case, start=pose, seed=k) for k, pose in enumerate(poses)]
-                    positions = release_all(cases, executor)
-                    largest = Drifts(arm, positions).largest
+                    more = mode, approach, options.duration
+                    cases = [executor.submit(one_release, arm, path, q, *more, k) for k, q in enumerate(poses)]
+                    positions = np.array([case.result() for case in cases])
+                    largest = np.abs(positions - positions[:, :1]).max(axis=1)
                     held = np.all(largest <= band, axis=1)
                     ripple = np.ptp(positions[:, -50:], axis=1).max(axis=0)  # in the last second
                     rows[f"{name}, {mode}, {APPROACHES[approach]}"] = [

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from dvrk_drake.dynamics.contact import Contact
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
     from dvrk_drake.errors import DvrkDrakeError
+    from dvrk_drake.experiments.ground_truth import perturbed_arm, simulate_poses
     from dvrk_drake.experiments.scenario import Scenario, load_scenario
     from dvrk_drake.experiments.simulation import simulate
     from dvrk_drake.export.model_export import export_model
@@ -95,11 +96,13 @@ _MODULES = {
     "load_scenario": "experiments.scenario",
     "load_station_config": "systems.station_config",
     "payload": "analysis.payload",
+    "perturbed_arm": "experiments.ground_truth",
     "predict": "analysis.validation",
     "read_recording": "recordings.reading",
     "recalibrate": "analysis.recalibration",
     "set_arm_positions": "models.plant",
     "simulate": "experiments.simulation",
+    "simulate_poses": "experiments.ground_truth",
     "start_meshcat": "systems.arm_view.page",
     "validate": "analysis.validation",
     "write_recording": "recordings.writing",
@@ -146,11 +149,13 @@ __all__ = [
     "load_station_config",
     "lock_joints",
     "payload",
+    "perturbed_arm",
     "predict",
     "read_recording",
     "recalibrate",
     "set_arm_positions",
     "simulate",
+    "simulate_poses",
     "start_meshcat",
     "validate",
     "write_recording",

@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from playwright.sync_api import sync_playwright
 
-from dvrk_drake.experiments.demo.demo import PHASES
+from dvrk_drake.experiments.demo.demo import RELEASE_TIME
 
 FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-gpu")
 #: Hides the control panel of Meshcat.
@@ -25,7 +25,7 @@ HIDE_CAPTIONS = """() => {
   for (const name of ["phase", "colours"]) captions[name].object.visible = false;
 }"""
 #: Texts on the pictures, with their colours: the arm, and the ghost while it is visible.
-ARM, GHOST = ("grey: identified model", "#1f1f1f"), ("orange: model that was not identified", "#a33b00")
+ARM, GHOST = ("grey: identified model", "#1f1f1f"), ("green: model that was not identified", "#1b6b40")
 TEXT_SIZE = 20
 #: Moves the paused animation to a time [s] and draws it.
 SHOW = """(time) => {
@@ -59,8 +59,7 @@ def label(picture: Image.Image, time: float) -> Image.Image:
     """Adds the captions of the animation at `time` [s] to a picture."""
     draw = ImageDraw.Draw(picture)
     font = ImageFont.load_default(TEXT_SIZE)
-    started = [text for start, text in PHASES if start <= time]
-    phase = started[-1].partition(":")[0]
+    phase = "released" if time >= RELEASE_TIME else "held"
     outcomes = (": stays", ": falls") if phase == "released" else ("", "")
     lines = [(text + outcome, colour) for (text, colour), outcome in zip((ARM, GHOST), outcomes, strict=True)]
     draw.rectangle((0, 0, picture.width, 2.9 * TEXT_SIZE), fill="#f4f6f8")
@@ -76,7 +75,7 @@ def write_gif(pictures: list[Image.Image], file: Path, period: float, colours: i
     strip = Image.new("RGB", (samples[0].width, samples[0].height * len(samples)))
     for i, sample in enumerate(samples):
         strip.paste(sample, (0, i * sample.height))
-    # The median cut would mix the orange of the ghost, which covers a small area, with the grey of the arm.
+    # The median cut would mix the green of the ghost, which covers a small area, with the grey of the arm.
     palette = strip.quantize(colours, method=Image.Quantize.MAXCOVERAGE)
     first, *rest = (picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures)
     first.save(file, save_all=True, append_images=rest, duration=round(1000 * period), loop=0, optimize=True)
@@ -88,7 +87,7 @@ def main() -> None:
     parser.add_argument("page", type=Path, help="arm.html of the demo")
     parser.add_argument("file", type=Path, help="GIF to write")
     parser.add_argument("--period", type=float, default=0.1, help="time between two pictures [s]")
-    parser.add_argument("--end", type=float, default=7.0, help="time of the last picture [s]")
+    parser.add_argument("--end", type=float, default=5.0, help="time of the last picture [s]")
     parser.add_argument("--size", nargs=2, type=int, default=[560, 460], metavar="pixels", help="width and height")
     parser.add_argument("--colours", type=int, default=128, help="number of colours")
     parser.add_argument("--chromium", default=shutil.which("chromium") or "chromium", help="program of the browser")

@@ -3,9 +3,9 @@
 python tools/make_samples.py
 
 The simulated arms have the friction, cables, stops, encoders, motors and delays of their arm files, except that the MTM
-has no wrist spring (see `perturbed_ground_truth`). The masses of their links differ from the SDF by up to 20 %, so the
-nominal model is wrong. Repeated runs on the same computer with the same packages give
-the same files.
+has no wrist spring, which balances a heavier wrist than that of the SDF. The masses of their links differ from the SDF
+by up to 20 %, so the nominal model is wrong. Repeated runs on the same computer with the same packages give the same
+files.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from pydrake.trajectories import PiecewisePolynomial
 
 import dvrk_drake as dvrk
 from dvrk_drake.cli.support import Steps
-from dvrk_drake.experiments.ground_truth import GroundTruth, collect, perturbed_ground_truth
+from dvrk_drake.experiments.ground_truth import collect
 from dvrk_drake.experiments.simulation import advance, sample_times, samples
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.progress import step_progress
@@ -34,6 +34,8 @@ from dvrk_drake.recordings.samples import SAMPLES, SAMPLES_FOLDER
 
 #: Seed of the masses, poses, motions and noise. Number of poses.
 SEED, POSES = 18, 60
+#: Effects that a simulated arm does not have.
+WITHOUT = {"mtmr": ("springs",)}
 #: Seed of each set of poses.
 POSE_SEEDS = {"mtm_poses": SEED, "mtm_other_poses": SEED + 1}
 #: Sampling rate [Hz] and duration [s] of a recorded motion. The simulation begins LEAD_IN [s] before the recording.
@@ -51,23 +53,22 @@ RANGES = {
 DECIMALS = {"t": 3, "q": 6, "qd": 4, "tau": 5}
 
 
-def static_poses(truth: GroundTruth, name: str, seed: int, progress: Callable[[float], object]) -> dvrk.Recording:
+def static_poses(simulated_arm: Arm, seed: int, progress: Callable[[float], object]) -> dvrk.Recording:
     """Returns static poses as `dvrk-drake collect` records them: means over two approach directions."""
     with ThreadPoolExecutor(1) as executor:
-        return collect(truth, name, POSES, seed, executor, progress)
+        return collect(simulated_arm, POSES, seed, executor, progress)
 
 
-def motion(truth: GroundTruth, name: str, progress: Callable[[float], object]) -> dvrk.Recording:
+def motion(simulated_arm: Arm, progress: Callable[[float], object]) -> dvrk.Recording:
     """Returns an excitation motion under position control.
 
     A dVRK computes velocities from the time between two encoder counts, with small error and delay. Therefore qd is the
     true velocity instead of the filtered velocity of the simulated encoders.
     """
-    arm = dvrk.load_arm(name)
+    arm, effects, name = dvrk.load_arm(simulated_arm.source), simulated_arm.effects, simulated_arm.source
     trajectory = desired_motion(arm)
-    station = dvrk.ArmStation(arm, plant_arm=truth.arm, effects=truth.arm.effects, seed=SEED)
-    cables_and_springs = [*truth.arm.effects.cables, *truth.arm.effects.springs]
-    controller = dvrk.GravityPidController(dvrk.IdentifiedModel.from_arm(arm, cables_and_springs))
+    station = dvrk.ArmStation(simulated_arm, effects=effects, seed=SEED)
+    controller = dvrk.GravityPidController(dvrk.IdentifiedModel.from_arm(arm, effects.position_dependent))
     builder = DiagramBuilder()
     dvrk.add_closed_loop(builder, station, controller, TrajectorySource(trajectory, output_derivative_order=1))
     logs = [
@@ -117,11 +118,13 @@ def main() -> None:
     SAMPLES_FOLDER.mkdir(exist_ok=True)
     with TemporaryDirectory() as folder, Steps(*SAMPLES) as steps:
         for sample, arm in SAMPLES.items():
-            truth, progress = perturbed_ground_truth(arm, Path(folder), SEED), step_progress(steps, sample)
+            path, without = Path(folder) / f"{arm}.sdf", WITHOUT.get(arm, ())
+            simulated_arm = dvrk.perturbed_arm(dvrk.load_arm(arm), path, SEED, without=without)
+            progress = step_progress(steps, sample)
             if sample in POSE_SEEDS:
-                recording = static_poses(truth, arm, POSE_SEEDS[sample], progress)
+                recording = static_poses(simulated_arm, POSE_SEEDS[sample], progress)
             else:
-                recording = motion(truth, arm, progress)
+                recording = motion(simulated_arm, progress)
             dvrk.write_recording(rounded(recording), SAMPLES_FOLDER / f"{sample}.csv")
 
 

@@ -67,3 +67,33 @@ def _last_direction(v: NDArray[np.float64], slow: float) -> NDArray[np.float64]:
     moving = np.abs(v) > slow
     last = np.maximum.accumulate(np.where(moving, np.arange(len(v)), -1))
     return np.where(last >= 0, np.sign(v[last]), 0.0)
+
+
+def pose_error_shares(
+    error: NDArray[np.float64], q: NDArray[np.float64], effort: NDArray[np.float64]
+) -> dict[str, float]:
+    """Returns the shares of the squared error of one joint at static poses, by cause. They sum to 1.
+
+    The causes are fitted in this order: offset, first and second harmonic of the position, predicted effort (load).
+    Each share is the additional reduction of the squared error.
+
+    Args:
+        error: Measured minus predicted effort (r,) [N m, N].
+        q: Position (r,) of the joint [rad, m].
+        effort: Predicted effort (r,) [N m, N].
+    """
+    total = float(np.mean(error**2)) or 1.0
+    remaining, shares = total, {}
+    columns: list[NDArray[np.float64]] = []
+    for name, own in (
+        ("bias", [np.ones_like(q)]),
+        ("first harmonic", [np.sin(q), np.cos(q)]),
+        ("second harmonic", [np.sin(2 * q), np.cos(2 * q)]),
+        ("load", [effort]),
+    ):
+        columns += own
+        X = np.column_stack(columns)
+        rest = float(np.mean((error - X @ np.linalg.lstsq(X, error, rcond=None)[0]) ** 2))
+        shares[name] = (remaining - rest) / total
+        remaining = rest
+    return shares | {"other": remaining / total}

@@ -36,18 +36,13 @@ def demo(
         arm: Arm to simulate.
     """
     from dvrk_drake.experiments.demo.demo import run_demo
-    from dvrk_drake.reports.demo import demo_page
-    from dvrk_drake.reports.html_file import write_html
-    from dvrk_drake.reports.image_files import write_images
-    from dvrk_drake.reports.provenance import Provenance
+    from dvrk_drake.reports.demo import write_demo
 
     output = new_folder(folder, overwrite=overwrite)
     with Steps(*_DEMO_STEPS) as steps:
         result = run_demo(output, arm, seed, steps)
         steps("drawing", 0.0)
-        page = demo_page(result, output)
-        write_images(page, output)
-        write_html(page, output / "report.html", Provenance.of([output / "poses.csv"], command_words))
+        page = write_demo(result, output, command_words)
     show_page(page, verbose=verbose)
     print_written(output)
 
@@ -112,8 +107,8 @@ def reproduce(
         data: Folder with mtm_2015_good72.csv (docs/reproduction.md). Default: $DVRK_DRAKE_SHARED/data/mtm_static.
     """
     from dvrk_drake.experiments.reproduction.published import PaperRecordings
-    from dvrk_drake.reports.reproduction.run import NAMES
-    from dvrk_drake.reports.reproduction.run import reproduce as reproduce_paper
+    from dvrk_drake.reports.reproduction.page import NAMES
+    from dvrk_drake.reports.reproduction.page import reproduce as reproduce_paper
     from dvrk_drake.reports.terminal import make_console
 
     recordings = PaperRecordings.find(data)
@@ -122,8 +117,8 @@ def reproduce(
     output = new_folder(folder, overwrite=overwrite)
     names = NAMES if what == "all" else (what,)
     with Steps(*names) as steps:
-        page, sections = reproduce_paper(names, output, recordings, steps, seed=seed, command=command_words)
+        page = reproduce_paper(names, output, recordings, steps, seed=seed, command=command_words)
     console = make_console()
-    for section in sections:
+    for section in page.sections[1:]:
         console.print(f"{section.title}: {section.finding}", markup=False)
-    print_written(page)
+    print_written(output / "index.html")

@@ -93,7 +93,7 @@ def study(
 
     Args:
         study: YAML file of the study.
-        output: Results file, .csv or .parquet. If it exists, only missing runs of the study are simulated.
+        output: Results file (.csv). If it exists, only missing runs of the study are simulated.
         workers: Number of processes on this computer, 1 to 1024. Default: one per core.
         scheduler: Address of a Dask cluster that runs the study, e.g. tcp://host:8786.
     """
@@ -102,8 +102,8 @@ def study(
     from dvrk_drake.reports.study import study_page
 
     loaded = load_study(study, set or [])
-    if not output.lower().endswith((".csv", ".parquet")):
-        raise StudyError(f"{output}: must end in .csv or .parquet")
+    if not output.lower().endswith(".csv"):
+        raise StudyError(f"{output}: must end in .csv")
     check_output(output, overwrite=True)
     results.check(study)
     step = f"simulating {len(loaded.cases)} runs"

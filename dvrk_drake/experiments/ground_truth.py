@@ -1,14 +1,10 @@
-"""Ground-truth arms, and functions that record static poses of a simulated arm.
-
-The links and effects of a ground-truth arm differ from those of the model that its controller uses.
-"""
+"""Simulated arms whose links differ from their model file, and static poses that are recorded on a simulated arm."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,11 +15,8 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 
-from dvrk_drake.analysis.pose_identification import identify_static
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia, link_inertias
-from dvrk_drake.dynamics.model_links import model_bodies
-from dvrk_drake.experiments.reproduction.published import PAPER_ARM
 from dvrk_drake.export.model_writer import to_text, with_inertias
 from dvrk_drake.models.approach import offset_pose
 from dvrk_drake.models.arm import Arm
@@ -34,6 +27,66 @@ from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 from dvrk_drake.workers import await_results
+
+#: Smallest and largest ratio of the mass of a link to its mass in the model file, unless stated otherwise.
+MASS_RATIOS = 0.8, 1.2
+
+
+def perturbed_arm(
+    arm: Arm,
+    path: str | Path,
+    seed: int | np.random.Generator,
+    *,
+    mass_ratios: tuple[float, float] = MASS_RATIOS,
+    max_shift: float = 0.0,
+    unchanged_links: Sequence[str] = (),
+    without: Sequence[str] = (),
+) -> Arm:
+    """Makes an arm whose links differ randomly from those of `arm`, as those of a real arm do.
+
+    Args:
+        arm: Arm with the nominal links.
+        path: SDF file to write. The returned arm uses it.
+        seed: Seed, or source, of the random numbers.
+        mass_ratios: Smallest and largest ratio of the mass of a link to its nominal mass.
+        max_shift: Maximum displacement of a centre of mass along each axis [m].
+        unchanged_links: Names of links that keep their nominal inertia, e.g. counterweights.
+        without: Names of effects of `arm` that the new arm does not have, e.g. "springs" for a spring that balances
+            other links than those of the model file.
+
+    Example:
+        >>> import dvrk_drake as dvrk
+        >>> arm = dvrk.load_arm("mtml")
+        >>> simulated_arm = dvrk.perturbed_arm(arm, "simulated_mtml.sdf", seed=1, without=["springs"])
+        >>> run = dvrk.simulate(simulated_arm, controller=dvrk.IdentifiedModel.from_arm(arm), duration=0.1)
+        >>> len(run.recording)
+        11
+    """
+    generator, links = np.random.default_rng(seed), []
+    for link in link_inertias(arm):
+        changed = link.parameters
+        if max_shift:
+            M = link.to_spatial_inertia()
+            com = M.get_com() + generator.uniform(-max_shift, max_shift, 3)
+            # The inertia about the centre of mass is unchanged, so the body remains physically consistent.
+            G = M.Shift(M.get_com()).get_unit_inertia().ShiftFromCenterOfMass(-com)
+            shifted = SpatialInertia(M.get_mass(), com, UnitInertia(G))
+            changed = LinkInertia.from_spatial_inertia(link.link, shifted).parameters
+        changed = changed * generator.uniform(*mass_ratios)
+        links.append(link if link.link in unchanged_links else LinkInertia(link.link, changed))
+    perturbed = with_links(arm, links, path, "a simulated arm with random links")
+    effects = arm.effects
+    for name in without:
+        effects = effects.without(name)
+    return dataclasses.replace(perturbed, effects=effects)
+
+
+def with_links(arm: Arm, links: Sequence[LinkInertia], path: str | Path, origin: str) -> Arm:
+    """Returns the arm with the given links; writes its SDF to `path`. A comment in the SDF states `origin`."""
+    with atomic_write(Path(path)) as stream:
+        stream.write(to_text(with_inertias(arm, links), f"{arm.name}, inertial parameters of {origin}."))
+    return dataclasses.replace(arm, sdf=(str(Path(path).resolve()),))
+
 
 #: Maximum joint speed between poses [rad/s], [m/s].
 TRAVEL_SPEED = 1.7, 0.2
@@ -93,7 +146,7 @@ def pose_visit_trajectory(
     return PiecewisePolynomial.CubicHermite(times, np.array(knots).T, zero), np.array(settled)
 
 
-def collect_static_poses(
+def simulate_poses(
     station: ArmStation,
     model: IdentifiedModel,
     poses: NDArray[np.float64],
@@ -102,7 +155,7 @@ def collect_static_poses(
     settle: float = SETTLE,
     progress: Callable[[float], object] = lambda share: None,
 ) -> Recording:
-    """Moves an arm to poses under position control and records the holding effort at each pose.
+    """Moves a simulated arm to poses under position control and records the holding effort at each pose.
 
     These are steps 4 to 6 of section III.G of the paper (Rutfield et al., WPI 2015).
 
@@ -117,6 +170,15 @@ def collect_static_poses(
 
     Returns:
         Recording with one row per pose: means of position and effort over `SAMPLES` samples and both approaches.
+
+    Example:
+        >>> import dvrk_drake as dvrk
+        >>> import numpy as np
+        >>> arm = dvrk.load_arm("psm")
+        >>> q = arm.sample_poses(2, np.random.default_rng(0), margin=0.1)
+        >>> recording = dvrk.simulate_poses(dvrk.ArmStation(arm), dvrk.IdentifiedModel.from_arm(arm), q)
+        >>> bool(np.allclose(recording.q, q, atol=1e-3))
+        True
     """
     arm = station.arm
     name = arm.name.lower()
@@ -139,120 +201,6 @@ def collect_static_poses(
     return Recording(q=q, tau=tau, source="simulated poses")
 
 
-#: Maximum relative change of a link's mass in a perturbed ground-truth arm.
-SPREAD = 0.2
-
-
-@dataclass(frozen=True, eq=False)
-class GroundTruth:
-    """Ground-truth arm with all effects of a real arm, and the exact model of its holding torque.
-
-    Attributes:
-        arm: Arm to simulate, with an SDF in the output folder and the `effects` of the real arm.
-        model: Exact model of the gravity, cable and spring torques, used only for evaluation.
-        is_paper_arm: Whether the parameters of the arm were identified from the paper's recording.
-        origin: Text that states the source of the arm's links and effects.
-    """
-
-    arm: Arm
-    model: IdentifiedModel
-    is_paper_arm: bool
-    origin: str
-
-
-def paper_arm(recording: Recording, folder: Path) -> GroundTruth:
-    """Identifies the paper's MTM from its recording and writes its SDF into `folder`.
-
-    The links are physically consistent and have the identified gravity torque. They are as close as possible to the
-    links of the SDF of this package. Cables and springs are those of the identified model. Friction, stops, encoders,
-    motors and delays are those of `mechanisms/mtm.yaml`, because static poses do not determine them. Friction that is
-    larger in one direction causes a constant torque in static poses, which is identified as an offset. The simulated
-    friction already contains this torque. Therefore the identified offset of a joint with such friction is omitted.
-
-    Raises:
-        RecordingError, IdentificationError, ModelError: The recording is not of an MTM at rest.
-    """
-    arm = load_arm(PAPER_ARM)
-    model = identify_static(recording, arm).model
-    direction_dependent = {law.coordinate for law in arm.effects.friction if law.kind == "presliding forward"}
-    kept_effects = [
-        e for e in model.effects if not (e.kind == "offset" and _at_actuator(e.coordinate) in direction_dependent)
-    ]
-    statistics = [dataclasses.replace(joint, feedforward_scale=1.0) for joint in model.joints]
-    model = dataclasses.replace(model, joints=statistics, effects=kept_effects)
-    laws = model.effects
-    effects = dataclasses.replace(arm.effects, cables=laws, springs=[])
-    ground_truth_arm = with_links(arm, model_bodies(model).links, folder / "true_mtm.sdf", "the paper's recording")
-    origin = (
-        "The ground-truth arm is the paper's MTM. Its gravity, cables and springs are identified from the paper's 72 "
-        "poses. Its friction, stops, encoders, motors and delays are those of another MTM (`mechanisms/mtm.yaml`). In "
-        "the paper's recording, joint 6 has only friction torque. Joint 7 has a constant torque, which is the "
-        "difference of its friction between both directions. Therefore the ground-truth arm probably needs less "
-        "compensation at these joints than the real arm."
-    )
-    return GroundTruth(dataclasses.replace(ground_truth_arm, effects=effects), model, True, origin)
-
-
-def _at_actuator(coordinate: str) -> str:
-    return "actuator." + coordinate.partition(".")[2]
-
-
-def perturbed_ground_truth(name: str, folder: Path, seed: int) -> GroundTruth:
-    """Makes a ground-truth arm whose link masses differ randomly from the SDF by up to `SPREAD`; writes its SDF.
-
-    An MTM made by this function has no wrist spring. The spring in the arm file balances a heavier wrist than that of
-    the SDF. With the wrist of the SDF, the torque of the spring would exceed the motor torque at many poses.
-    """
-    arm = load_arm(name)
-    links = perturbed_links(arm, np.random.default_rng(seed))
-    ground_truth_arm = with_links(arm, links, folder / f"true_{name}.sdf", "a simulated arm with random link masses")
-    if name == PAPER_ARM:
-        ground_truth_arm = dataclasses.replace(ground_truth_arm, effects=arm.effects.without("springs"))
-    laws = [*ground_truth_arm.effects.cables, *ground_truth_arm.effects.springs]
-    model = dataclasses.replace(IdentifiedModel.from_arm(ground_truth_arm, laws), arm=arm)
-    origin = (
-        f"The ground-truth arm has the links of the SDF with random changes of their masses by up to "
-        f"{100 * SPREAD:.0f} % (seed {seed}). Its effects are those of `mechanisms/`: friction, cables, encoders, "
-        f"motors and delays."
-    )
-    return GroundTruth(ground_truth_arm, model, False, origin)
-
-
-def perturbed_links(
-    arm: Arm,
-    generator: np.random.Generator,
-    shift: float = 0.0,
-    mass_ratios: tuple[float, float] = (1 - SPREAD, 1 + SPREAD),
-) -> list[LinkInertia]:
-    """Returns the links with random masses and centres of mass.
-
-    Args:
-        arm: Arm with the nominal links.
-        generator: Source of the random numbers.
-        shift: Maximum displacement of a centre of mass along each axis [m].
-        mass_ratios: Smallest and largest ratio of the mass of a link to its nominal mass.
-    """
-    links = []
-    for link in link_inertias(arm):
-        parameters = link.parameters
-        if shift:
-            M = link.to_spatial_inertia()
-            com = M.get_com() + generator.uniform(-shift, shift, 3)
-            # The inertia about the centre of mass is unchanged, so the body remains physically consistent.
-            G = M.Shift(M.get_com()).get_unit_inertia().ShiftFromCenterOfMass(-com)
-            shifted = SpatialInertia(M.get_mass(), com, UnitInertia(G))
-            parameters = LinkInertia.from_spatial_inertia(link.link, shifted).parameters
-        links.append(LinkInertia(link.link, parameters * generator.uniform(*mass_ratios)))
-    return links
-
-
-def with_links(arm: Arm, links: Sequence[LinkInertia], path: Path, origin: str) -> Arm:
-    """Returns the arm with the given links; writes its SDF to `path`. A comment in the SDF states `origin`."""
-    with atomic_write(path) as stream:
-        stream.write(to_text(with_inertias(arm, links), f"{arm.name}, inertial parameters of {origin}."))
-    return dataclasses.replace(arm, sdf=(str(path.resolve()),))
-
-
 #: Distance between a pose and the start of an approach to it [rad], [m]. In the mean over two opposite approaches, dry
 #: friction cancels.
 APPROACH = 0.2, 0.02
@@ -263,36 +211,29 @@ _CHUNK = 10
 
 
 def collect(
-    truth: GroundTruth,
-    name: str,
-    count: int,
-    seed: int,
-    executor: Executor,
-    progress: Callable[[float], object] = lambda share: None,
+    arm: Arm, count: int, seed: int, executor: Executor, progress: Callable[[float], object] = lambda share: None
 ) -> Recording:
-    """Collects static poses of a ground-truth arm with all its effects.
+    """Collects static poses of a perturbed arm with all its effects.
 
     The arm approaches each pose from two opposite directions, and the recording contains the mean. The controller uses
     the nominal model. The workers of the executor collect chunks of poses in parallel. Each chunk has a separate start
     pose and separate noise, so the result does not depend on the number of workers.
     """
-    arm = load_arm(name)
     poses = arm.sample_poses(count, np.random.default_rng(seed), margin=MARGIN)
     multi_turn = (arm.position_upper - arm.position_lower > 4 * np.pi) & ~arm.prismatic
     poses[:, multi_turn] = np.clip(poses[:, multi_turn], -MAX_MULTI_TURN_ANGLE, MAX_MULTI_TURN_ANGLE)
     chunks = np.array_split(poses, -(-count // _CHUNK))
-    futures = [executor.submit(_collect_chunk, name, truth.arm, c, seed + i) for i, c in enumerate(chunks)]
+    futures = [executor.submit(_collect_chunk, arm, c, seed + i) for i, c in enumerate(chunks)]
     rows = np.concatenate(await_results(futures, progress))
     q, tau = np.split(rows, 2, axis=1)
     return Recording(q=q, tau=tau, source=f"{count} poses of the simulated {arm.name}")
 
 
-def _collect_chunk(name: str, ground_truth_arm: Arm, poses: NDArray[np.float64], seed: int) -> NDArray[np.float64]:
+def _collect_chunk(arm: Arm, poses: NDArray[np.float64], seed: int) -> NDArray[np.float64]:
     """Returns rows (m, 2n) of q and tau, one per pose: means over two opposite approaches to the pose."""
-    arm = load_arm(name)
     offset = arm.per_joint(*APPROACH)
     visited = np.concatenate([[offset_pose(arm, q, -offset), q, offset_pose(arm, q, offset), q] for q in poses])
-    station = ArmStation(arm, plant_arm=ground_truth_arm, effects=ground_truth_arm.effects, seed=seed)
-    recording = collect_static_poses(station, IdentifiedModel.from_arm(arm), visited)
+    station = ArmStation(arm, effects=arm.effects, seed=seed)
+    recording = simulate_poses(station, IdentifiedModel.from_arm(load_arm(arm.source)), visited)
     rows = np.hstack([recording.q, recording.measured_effort()])
     return (rows[1::4] + rows[3::4]) / 2

@@ -31,7 +31,6 @@ from dvrk_drake.systems.station_config import ArmConfig
 MAX_LENGTH, MIN_SAMPLE_PERIOD = 3600.0, 1e-3
 #: Coarse bounds of positions; `check_pose` checks the limits of the arm.
 _POSITIONS = within(-1e4, 1e4, "rad or m")
-_GRIP = {grip.name: grip for grip in dataclasses.fields(Grip)}
 
 
 @dataclass
@@ -40,6 +39,7 @@ class ControllerScenario:
 
     Attributes:
         mode: Mode of the controller: "hold", "gravity", "damped" or "guide".
+        release_time: Time at which the controller changes from mode "hold" to `mode` [s]. 0: `mode` from the start.
         model: Path of a model file. If empty, the controller uses the model of the SDF.
         compensated_effects: Effects of the arm ("cables", "springs") that are added to the model of the SDF. Not
             allowed together with `model`.
@@ -54,6 +54,7 @@ class ControllerScenario:
     """
 
     mode: str = "hold"
+    release_time: float = field(default=0.0, metadata=within(0.0, MAX_LENGTH, "s"))
     model: str = ""
     compensated_effects: list[str] = field(default_factory=list)
     gains: Gains | None = None
@@ -85,24 +86,12 @@ class HandScenario:
     Attributes:
         path: Joint positions and times.
         frame: Frame of the arm's SDF that the hand holds. Default: the frame `frames.hand` of the arm.
-        stiffness, damping, rotational_stiffness, rotational_damping, max_force, max_torque: Parameters of the `Grip`.
+        grip: Stiffness, damping and limits of the grip.
     """
 
     path: list[Target] = field(default_factory=list)
     frame: str = ""
-    stiffness: float = field(default=Grip.stiffness, metadata=_GRIP["stiffness"].metadata)
-    damping: float = field(default=Grip.damping, metadata=_GRIP["damping"].metadata)
-    rotational_stiffness: float = field(
-        default=Grip.rotational_stiffness, metadata=_GRIP["rotational_stiffness"].metadata
-    )
-    rotational_damping: float = field(default=Grip.rotational_damping, metadata=_GRIP["rotational_damping"].metadata)
-    max_force: float = field(default=Grip.max_force, metadata=_GRIP["max_force"].metadata)
-    max_torque: float = field(default=Grip.max_torque, metadata=_GRIP["max_torque"].metadata)
-
-    @property
-    def grip(self) -> Grip:
-        """Stiffness, damping and limits of the grip."""
-        return Grip(**{f.name: getattr(self, f.name) for f in dataclasses.fields(Grip)})
+    grip: Grip = field(default_factory=Grip)
 
 
 @dataclass
@@ -117,8 +106,8 @@ class Scenario(ArmConfig):
         sample_period: Sample period of the recording [s].
         controller: Controller of the arm.
         start: Start pose (n,) [rad, m], at rest. Default: zero, or the nearest pose inside the limits.
-        targets: Desired poses with their times. The desired velocities are zero at these times. Targets are allowed
-            only in mode "hold".
+        targets: Desired poses with their times. The desired velocities are zero at these times. In modes other than
+            "hold", targets are allowed only up to `controller.release_time`.
         hand: Hand that moves the arm.
         effort_noise: Standard deviation of the noise of recorded efforts, as a share of the effort limits.
 
@@ -158,6 +147,11 @@ class Scenario(ArmConfig):
         generator = np.random.default_rng([self.seed, 1])
         return model.with_scaled_parameters(generator.uniform(1 - error, 1 + error, len(model.base_parameters)))
 
+    @property
+    def regulated_until(self) -> float:
+        """Time until which the controller regulates the desired positions [s]."""
+        return self.duration if self.controller.mode == "hold" else self.controller.release_time
+
     def knots(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Returns the times (m,) [s] and poses (m, n) [rad, m] of the start and the targets."""
         arm = self.mounted_arm
@@ -178,6 +172,11 @@ class Scenario(ArmConfig):
         _check_choice("controller.mode", self.controller.mode, get_args(Mode))
         if self.duration < self.sample_period:
             raise ScenarioError(f"duration is {self.duration:g}; allowed: {self.sample_period:g}..{MAX_LENGTH:g} s")
+        if self.controller.release_time >= self.duration:
+            raise ScenarioError(
+                f"controller.release_time is {self.controller.release_time:g} s; allowed: before the end of the "
+                f"simulation at {self.duration:g} s"
+            )
         if self.start is not None:
             check_pose("start", self.start, arm)
         self._check_targets("targets", self.targets, 0.0)
@@ -197,8 +196,11 @@ class Scenario(ArmConfig):
                     f'controller.{name} requires controller.mode "gravity" or "guide"; the mode is '
                     f'"{self.controller.mode}"'
                 )
-        if self.targets and self.controller.mode != "hold":
-            raise ScenarioError(f'targets require controller.mode "hold"; the mode is "{self.controller.mode}"')
+        if self.targets and self.targets[-1].time > self.regulated_until:
+            raise ScenarioError(
+                f'targets require controller.mode "hold" or a later controller.release_time; the mode is '
+                f'"{self.controller.mode}" from {self.regulated_until:g} s on'
+            )
         _ = self.model  # raises an error for a model of another arm
 
     def _check_targets(self, name: str, targets: list[Target], after: float) -> None:

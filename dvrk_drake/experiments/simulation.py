@@ -42,7 +42,7 @@ class Simulation:
         state_true: True state (m, 2n): positions [rad, m], then velocities [rad/s, m/s].
         hand: Torque [N m], then force [N] of the hand on the arm (m, 6) at the grasped frame, expressed in the base
             frame. Zero without a hand.
-        desired: Desired positions (m, n) [rad, m]. None in modes other than "hold".
+        desired: Desired positions (m, n) [rad, m]. None if the mode is not "hold" during the whole simulation.
         effort_commanded: Efforts (m, n) that the controller commands [N m, N], or None.
     """
 
@@ -68,12 +68,15 @@ def simulate(
     what: Arm | Scenario,
     *,
     controller: IdentifiedModel | System | None = None,
+    mode: Mode | None = None,
+    release_time: float | None = None,
     effects: bool | Sequence[str] | None = None,
     duration: float | None = None,
     start: ArrayLike | None = None,
     targets: Sequence[tuple[float, ArrayLike]] | None = None,
     sample_period: float | None = None,
     seed: int | None = None,
+    closure: Closure | None = None,
     meshcat: Meshcat | None = None,
     progress: Progress | None = None,
 ) -> Simulation:
@@ -84,10 +87,13 @@ def simulate(
 
     Args:
         what: Arm that is regulated at a pose or moves to `targets`, or a scenario. With a scenario, the arguments from
-            `controller` to `seed` are not allowed, because the scenario contains these settings.
+            `controller` to `closure` are not allowed, because the scenario contains these settings.
         controller: Model for a `GravityPidController`, or a System with an input port `state_estimated` (2n) and an
             output port `effort` (n), e.g. a `GravityPidController`. Default: the model of the arm's SDF. `targets` have
             an effect only if the System has an input port `desired_state` (2n). A System can be used only once.
+        mode: Mode of the `GravityPidController`: "hold", "gravity", "damped" or "guide". Default: "hold".
+        release_time: Time at which the controller changes from mode "hold" to `mode` [s]. Default: `mode` from the
+            start.
         effects: Whether to simulate the effects of a real arm (friction, cables, stops, encoders, motors), or the names
             of the effects to simulate. Default: True.
         duration: Duration of the simulation [s]. Default: 5.
@@ -95,6 +101,7 @@ def simulate(
         targets: Pairs of a time [s] and the desired pose (n,) [rad, m] at this time, with zero desired velocity.
         sample_period: Sample period of the recording [s]. Default: 0.01.
         seed: Seed of the effects' noise. Default: 0.
+        closure: Method that closes the loops of the linkage, "ball" or "mimic", see `add_arm`. Default: "ball".
         meshcat: Meshcat that shows the arm in real time, and the recorded animation at the end. None: no animation.
         progress: Function called with the name of the step ("simulating") and its finished share, 0..1.
 
@@ -122,13 +129,14 @@ def simulate(
             f"`controller` is a {kind}; allowed: an IdentifiedModel (attribute `model` of an identification result) or "
             "a System"
         )
-    given: dict[str, Any] = {"duration": duration, "sample_period": sample_period, "seed": seed}
+    settings: dict[str, Any] = {"mode": mode, "release_time": release_time}
+    given: dict[str, Any] = {"duration": duration, "sample_period": sample_period, "seed": seed, "closure": closure}
     if isinstance(what, Arm):
         scenario = scenario_of_arm(what, True if effects is None else effects, start, targets or ())
-        for name, value in given.items():
-            if value is not None:
-                setattr(scenario, name, value)
-        scenario.mounted_arm = what
+        for part, values in ((scenario, given), (scenario.controller, settings)):
+            for name, value in values.items():
+                if value is not None:
+                    setattr(part, name, value)
         if isinstance(controller, IdentifiedModel):
             if controller.arm.name != what.name:
                 raise ScenarioError(
@@ -137,7 +145,7 @@ def simulate(
                 )
             scenario.model = controller
     else:
-        given |= {"controller": controller, "effects": effects, "start": start, "targets": targets}
+        given |= settings | {"controller": controller, "effects": effects, "start": start, "targets": targets}
         if extra := [name for name, value in given.items() if value is not None]:
             raise ScenarioError(
                 f"`{extra[0]}` cannot be given with a scenario. Set it in the scenario, or give an arm."
@@ -155,7 +163,8 @@ def _simulate(
     arm = scenario.mounted_arm
     name = arm.name.lower()
     times, poses = scenario.knots()
-    holds = scenario.controller.mode == "hold" and (system is None or system.HasInputPort("desired_state"))
+    mode, release_time = cast(Mode, scenario.controller.mode), scenario.controller.release_time
+    holds = scenario.regulated_until > 0 and (system is None or system.HasInputPort("desired_state"))
     station = ArmStation(
         arm,
         closure=cast(Closure, scenario.closure),
@@ -168,7 +177,7 @@ def _simulate(
         scenario.model,
         period=scenario.time_step,
         gains=scenario.controller.gains,
-        mode=cast(Mode, scenario.controller.mode),
+        mode="hold" if release_time else mode,
     )
     trajectory = _trajectory(times, poses, scenario.duration)
     desired = TrajectorySource(trajectory, output_derivative_order=1) if holds else None
@@ -185,20 +194,27 @@ def _simulate(
         desired_port = desired.get_output_port() if desired is not None else None
         add_overlay(builder, station, ArmOverlay(arm, meshcat), desired_port, phases(scenario))
     simulator = Simulator(builder.Build())
-    context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
-    station.SetPositions(context, poses[0])
+    root = simulator.get_mutable_context()
+    station.SetPositions(station.GetMyMutableContextFromRoot(root), poses[0])
     if meshcat is not None:
         simulator.set_target_realtime_rate(1.0)
     t = sample_times(scenario.duration, scenario.sample_period)
     with recorded_in(meshcat):
-        advance(simulator, t, report)
+        if release_time and isinstance(controller, GravityPidController):
+            # AdvanceTo the current time would perform a step, so the release is not a sample of the second part.
+            held = np.append(t[t < release_time - 1e-9], release_time)
+            advance(simulator, held, lambda share: report(share * release_time / t[-1]))
+            controller.SetMode(controller.GetMyMutableContextFromRoot(root), mode)
+            advance(simulator, t[t > release_time + 1e-9], report)
+        else:
+            advance(simulator, t, report)
     estimated, tau, state_true, effort_commanded, *hand_forces = (samples(log, simulator) for log in logs)
     q, qd = np.hsplit(estimated, 2)
     noise = np.random.default_rng(scenario.seed).normal(size=tau.shape)
     tau = tau + scenario.effort_noise * arm.effort_limits * noise
     recording = Recording(q=q, qd=qd, tau=tau, t=t, source="simulation")
     hand_force = hand_forces[0] if hand_forces else np.zeros((len(t), 6))
-    desired_positions = trajectory.vector_values(t).T if holds else None
+    desired_positions = trajectory.vector_values(t).T if holds and mode == "hold" else None
     return Simulation(recording, state_true, hand_force, desired_positions, effort_commanded)
 
 
@@ -250,16 +266,18 @@ def recorded_in(meshcat: Meshcat | None, **options: Any) -> Iterator[None]:
 def scenario_of_arm(
     arm: Arm, effects: bool | Sequence[str], start: ArrayLike | None, targets: Sequence[tuple[float, ArrayLike]]
 ) -> Scenario:
-    """Converts an arm and other arguments of `simulate` to a scenario."""
+    """Converts an arm and other arguments of `simulate` to a scenario of this arm."""
     if isinstance(effects, bool):
         effects = ["all"] if effects else []
-    return Scenario(
+    scenario = Scenario(
         arm=arm.source,
         gravity=arm.gravity.tolist(),
         start=None if start is None else np.asarray(start, float).tolist(),
         targets=[Target(float(time), np.asarray(pose, float).tolist()) for time, pose in targets],
         simulated_effects=[effects] if isinstance(effects, str) else list(effects),
     )
+    scenario.mounted_arm = arm
+    return scenario
 
 
 def _trajectory(times: NDArray[np.float64], poses: NDArray[np.float64], duration: float) -> PiecewisePolynomial:
@@ -272,12 +290,11 @@ def phases(scenario: Scenario) -> Callable[[float], str]:
     """Returns a function from a time [s] to the name of the phase of a scenario, for a caption."""
     times, poses = scenario.knots()
     hand = [target.time for target in scenario.hand.path]
-    holds = scenario.controller.mode == "hold"
 
     def phase(time: float) -> str:
         if hand and hand[0] <= time <= hand[-1]:
             return "a hand moves the arm"
-        if not holds:
+        if time >= scenario.regulated_until and scenario.controller.mode != "hold":
             return "gravity compensation"
         after = int(np.searchsorted(times, time, side="right"))
         if 0 < after < len(times) and np.any(poses[after] != poses[after - 1]):

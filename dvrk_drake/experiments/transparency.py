@@ -219,10 +219,6 @@ def listed_compensations(arm: Arm, paths: Sequence[str], friction_ratio: float) 
         name = Path(path).stem
         if name in models:
             raise ModelError(f"--model {path}: two models have the file name {name}; rename one of the files")
-        if "=" in path and not Path(path).is_file():
-            raise ModelError(
-                f"--model {path}: no such file. The form NAME=PATH is not supported; give the path of the model file"
-            )
         models[name] = IdentifiedModel.load(path, arm)
     if not models:
         models["SDF"] = IdentifiedModel.from_arm(arm)

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.experiments.demo.demo import PLANS, DemoResult
+from dvrk_drake.experiments.demo.demo import DemoResult, load_plan
 from dvrk_drake.experiments.demo.teleoperation import TeleoperationResult
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.reports.colours import FITTED, LIMIT, MEASURED, NEUTRAL, REFERENCE
+from dvrk_drake.models.files import atomic_write
+from dvrk_drake.reports.colours import FITTED, LIMIT, NEUTRAL, REFERENCE
+from dvrk_drake.reports.html_file import write_html
+from dvrk_drake.reports.image_files import write_images
 from dvrk_drake.reports.page import Block, Command, Page, Plot, Scene, Section, Table, Text
-from dvrk_drake.reports.plot import Curve, Dots, Guide, Mark, Panel, category_panel, joint_label
+from dvrk_drake.reports.plot import Curve, Guide, Mark, Panel, joint_label
+from dvrk_drake.reports.provenance import Provenance
 
 _REAL_ARM = (
     "With a real arm: record at least 40 different static poses with `dvrk-drake collect`, or convert a recording of "
@@ -22,6 +27,37 @@ _REAL_ARM = (
 )
 #: Smallest half-width of the drift axis, as a multiple of the limit of the drift.
 _MIN_RANGE = 2.0
+
+
+def write_demo(result: DemoResult, folder: Path, command: Sequence[str] = ()) -> Page:
+    """Writes report.html, arm.html (animation) and the plots as images to the folder of a demo; returns the page.
+
+    Args:
+        result: Result of the demo.
+        folder: Output folder of `run_demo`.
+        command: Words of the command line, for the provenance.
+    """
+    from dvrk_drake.reports.playback import playback  # slow to import
+
+    arm = result.arm
+    view = playback(
+        arm,
+        result.time,
+        result.identified,
+        ghost=result.nominal,
+        phases=(
+            (float(result.time[0]), "held: the controller regulates the pose"),
+            (0.0, "released: gravity compensation only"),
+        ),
+        colors={"#a0a4a8": "controlled with the identified model", REFERENCE: "controlled with the model of the SDF"},
+        title=f"{arm.name} (simulated) - dvrk-drake demo",
+    )
+    with atomic_write(folder / "arm.html") as stream:
+        stream.write(view)
+    page = demo_page(result, folder)
+    write_images(page, folder)
+    write_html(page, folder / "report.html", Provenance.of([folder / "poses.csv"], command))
+    return page
 
 
 def demo_page(result: DemoResult, folder: Path) -> Page:
@@ -39,7 +75,7 @@ def demo_page(result: DemoResult, folder: Path) -> Page:
         drift = (f"{1e3 * drifts[model][i]:.1f}" for model in ("identified", "nominal"))
         errors = (f"{error:.4f}" for error in (ours.rms_error, sdf.rms_error, ours.rms_torque))
         rows.append((ours.name, *drift, *errors))
-    low, high = PLANS[arm.source].mass_ratios
+    low, high = load_plan(arm.source).mass_ratios
     blocks: list[Block] = [
         Table(
             ("", "drift, identified", "drift, SDF", "error, identified", "error, SDF", "zero torque"),
@@ -56,17 +92,17 @@ def demo_page(result: DemoResult, folder: Path) -> Page:
         Text(_REAL_ARM, show="details"),
     ]
     view = folder / "arm.html"
-    scene = [Scene(view.read_text, "Release with the identified model (grey) and with the model of the SDF (green)")]
+    caption = "Release with the identified model (grey) and with the model of the SDF (green)"
+    scene = [Scene(view.read_text, caption, start=float(result.time[0]))]
     identify = f"dvrk-drake identify {folder}/poses.csv --arm {arm.source} --output MODEL.yaml --report report.html"
     return Page(
         f"Demo: {arm.name}, simulated",
         f"Verdict: the identified model {'holds' if held else 'does not hold'} the released {arm.name} for "
-        f"{duration:g} s. Largest drift: {largest['identified']}, limit 15 mrad. With the model of the SDF, the same "
-        f"arm {result.nominal_outcome}. Its largest drift is {largest['nominal']}.",
+        f"{duration:g} s. Largest drift: {largest['identified']}, limit 15 mrad. With the model of the SDF, the "
+        f"largest drift of the same arm is {largest['nominal']}.",
         [
             Section("Drift and torque errors", blocks),
             Section("Release", [*scene, _drift_plot(result)]),
-            Section("Errors at new poses", [_error_plot(result)]),
             Section("With your own recording", [Command(identify, "Plots and parameters with intervals.")]),
         ],
         "good" if held else "warning",
@@ -90,8 +126,7 @@ def _drift_plot(result: DemoResult) -> Plot:
     limits = "15 mrad or 1.5 mm" if np.any(arm.prismatic) else "15 mrad"
     for j in range(arm.num_joints):
         q0, held = result.identified[0, j], 1e3 * result.limits[j]
-        nominal = 1e3 * (result.nominal[:, j] - result.nominal[0, j])
-        identified = 1e3 * (result.identified[:, j] - q0)
+        nominal, identified = (1e3 * result.drift(model)[:, j] for model in ("nominal", "identified"))
         marks: list[Mark] = [
             Guide("y", -held, held, NEUTRAL, f"limit of a held joint: {limits}"),
             Curve("model of the SDF (not identified)", t, nominal, REFERENCE, "dashed"),
@@ -106,21 +141,7 @@ def _drift_plot(result: DemoResult) -> Plot:
         margin = 0.05 * (high - low)
         y_range = (low - margin, high + margin)
         panels.append(Panel(joint_label(arm, j), marks, "time since the release [s]", label, y_range=y_range))
-    return Plot("drift", "Drift from the release position with both models", panels, columns=2)
-
-
-def _error_plot(result: DemoResult) -> Plot:
-    """Returns the RMS torque errors of both models and of zero torque at poses that were not used for fitting."""
-    names = [joint_label(result.arm, j) for j in range(result.arm.num_joints)]
-    dots = [
-        Dots("zero torque", names, [joint.rms_torque for joint in result.fresh.joints], MEASURED),
-        Dots("model of the SDF", names, [joint.rms_error for joint in result.fresh_nominal.joints], REFERENCE),
-        Dots("identified model", names, [joint.rms_error for joint in result.fresh.joints], FITTED, style="diamonds"),
-    ]
-    forces = "".join(f"; J{j + 1}: N" for j in np.flatnonzero(result.arm.prismatic))
-    panel = category_panel("", dots, f"RMS torque error [N m{forces}]", log_x=True)
-    caption = f"RMS torque error at {result.fresh.poses} poses that were not used for fitting"
-    return Plot("torque_error", caption, [panel])
+    return Plot("drift", "Drift from the release position with both models", panels, columns=2, time=True)
 
 
 def teleoperation_page(result: TeleoperationResult, file: str) -> Page:

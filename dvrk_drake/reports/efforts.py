@@ -14,7 +14,7 @@ from dvrk_drake.analysis.observations.excluded_measurements import ExcludedMeasu
 from dvrk_drake.analysis.observations.motion_grid import MotionGrid
 from dvrk_drake.analysis.pose_identification import StaticIdentification
 from dvrk_drake.analysis.pose_validation import StaticValidation
-from dvrk_drake.analysis.residual_structure import residual_structure
+from dvrk_drake.analysis.residual_structure import pose_error_shares, residual_structure
 from dvrk_drake.analysis.results import Identification, Validation
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm
@@ -25,7 +25,6 @@ from dvrk_drake.reports.plot import (
     Band,
     Bars,
     Curve,
-    Dots,
     Guide,
     Mark,
     Panel,
@@ -219,24 +218,6 @@ def _title(efforts: Efforts, j: int) -> str:
     return f"{label}: RMS error / RMS effort: {', '.join(errors)}"
 
 
-def predicted_plot(efforts: Efforts) -> Plot:
-    """Returns predicted over measured effort of static poses, without excluded measurements."""
-    arm, panels = efforts.arm, []
-    for j in range(arm.num_joints):
-        use = efforts.usable[:, j]
-        measured, unit = efforts.measured[use, j], effort_unit(arm, j)
-        marks: list[Mark] = []
-        for name, values in efforts.predicted.items():
-            style: Style = "circles" if name == "fitted" else "crosses"
-            marks.append(Curve(name, measured, values[use, j], _COLOURS[name], style))
-        ends = [measured.min(), measured.max()] if len(measured) else [0.0, 0.0]
-        marks.append(Curve("predicted = measured", ends, ends, MEASURED))
-        labels = f"measured [{unit}]", f"predicted [{unit}]"
-        panels.append(Panel(joint_label(arm, j), marks, *labels, height=230))
-    caption = "Predicted against measured effort of each pose, without excluded measurements"
-    return Plot("predicted", caption, panels, columns=2)
-
-
 def residuals_plot(efforts: Efforts, name: str = "residuals") -> Plot:
     """Returns the residuals over position and, for a motion, over speed: dots, mean and standard deviation in bins."""
     arm, panels, step = efforts.arm, [], 1
@@ -296,8 +277,7 @@ def bin_means(
 def budget_of(efforts: Efforts) -> dict[str, dict[str, float]]:
     """Returns the shares of the squared error of each joint with an effort, by cause. The shares of a joint sum to 1.
 
-    For a motion, see `ErrorShares`. For static poses, the causes are fitted in this order: offset, first and second
-    harmonic of the position, predicted effort (load). Each share is the additional reduction of the squared error.
+    For a motion, see `ErrorShares`; for static poses, see `pose_error_shares`.
     """
     grid, budgets = efforts.grid, {}
     vd = None
@@ -312,26 +292,8 @@ def budget_of(efforts: Efforts) -> dict[str, dict[str, float]]:
             shares = error_shares(error, j, efforts.q, efforts.v[:, j], vd, efforts.x, efforts.period)
             budgets[name] = {label: share or 0.0 for label, share in zip(SHARE_LABELS, shares, strict=True)}
         else:
-            budgets[name] = _pose_shares(error, q, efforts.predicted[efforts.judged][use, j])
+            budgets[name] = pose_error_shares(error, q, efforts.predicted[efforts.judged][use, j])
     return budgets
-
-
-def _pose_shares(error: NDArray[np.float64], q: NDArray[np.float64], load: NDArray[np.float64]) -> dict[str, float]:
-    total = float(np.mean(error**2)) or 1.0
-    remaining, shares = total, {}
-    columns: list[NDArray[np.float64]] = []
-    for name, own in (
-        ("bias", [np.ones_like(q)]),
-        ("first harmonic", [np.sin(q), np.cos(q)]),
-        ("second harmonic", [np.sin(2 * q), np.cos(2 * q)]),
-        ("load", [load]),
-    ):
-        columns += own
-        X = np.column_stack(columns)
-        rest = float(np.mean((error - X @ np.linalg.lstsq(X, error, rcond=None)[0]) ** 2))
-        shares[name] = (remaining - rest) / total
-        remaining = rest
-    return shares | {"other": remaining / total}
 
 
 def budget_plot(efforts: Efforts, name: str = "error_budget") -> Plot:
@@ -347,9 +309,6 @@ def budget_plot(efforts: Efforts, name: str = "error_budget") -> Plot:
         if np.any(shares > 0.005):
             texts = [f"{j}, {cause}: {100 * s:.0f} % of the squared error" for j, s in zip(joints, shares, strict=True)]
             marks.append(Bars(cause, joints, relative * shares, colour, texts))
-    if np.any(efforts.repeatability > 0):
-        floor = 100 * efforts.repeatability[rows] / effort
-        marks.append(Dots("repeatability", joints, np.where(floor > 0, floor, np.nan), MEASURED, style="diamonds"))
     caption = f"Relative RMS error of the {efforts.judged.replace(' ', '-')} efforts and its causes"
     return Plot(name, caption, [category_panel("", marks, "RMS error / RMS effort [%]")])
 

@@ -24,7 +24,6 @@ from dvrk_drake.reports.efforts import (
     budget_plot,
     efforts_of,
     efforts_plot,
-    predicted_plot,
     residuals_plot,
     structure_table,
 )
@@ -130,7 +129,16 @@ def _baseline_ratios(efforts: Efforts) -> dict[str, NDArray[np.float64]]:
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence], caption: str, zero_torque: str) -> Table:
-    """Returns a table with one row per joint. `zero_torque` is the relative error of zero torque as text."""
+    """Returns a table with one row per joint, without empty columns.
+
+    Args:
+        header: Headings of the columns after the joint and its verdict.
+        rows: Cells of all columns.
+        caption: Caption.
+        zero_torque: Relative error of zero torque as text.
+    """
+    kept = [k for k in range(2 + len(header)) if k < 2 or any(row[k] != "" for row in rows)]
+    header, rows = [header[k - 2] for k in kept[2:]], [[row[k] for k in kept] for row in rows]
     note = ""
     if "SDF error" in header:
         note = (
@@ -320,8 +328,6 @@ def _effort_sections(efforts: Efforts, name: str, suffix: str) -> list[Section]:
     of = f": {name}" if name else ""
     views = [] if suffix else [_view(efforts)]
     blocks: list[Block] = [*views, efforts_plot(efforts, f"efforts{suffix}", time=not suffix)]
-    if efforts.v is None:
-        blocks.append(predicted_plot(efforts))
     note = (
         "Predicted: efforts of the model for the positions of this recording."
         if efforts.judged == "predicted"

@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.reports.colours import SERIES
 from dvrk_drake.reports.page import Page, Plot
-from dvrk_drake.reports.plot import Band, Bars, Curve, Dots, Guide, Mark, Panel
+from dvrk_drake.reports.plot import Band, Bars, Curve, Guide, Mark, Panel
 
 #: Width of all images [inch].
 WIDTH = 11.0
@@ -92,13 +92,8 @@ def draw_plot(plot: Plot, title: str) -> Figure:
 def _draw(ax: Axes, panel: Panel, loc: Any, width: int) -> None:
     categories = panel.categories
     left = np.zeros(len(categories))
-    count = sum(isinstance(mark, Dots) for mark in panel.marks)
-    for k, mark in enumerate(panel.marks):
-        # Dots of one category are drawn below each other, so that they do not hide each other.
-        offset = 0.0 if count < 2 else 0.6 * (k / (count - 1) - 0.5)
-        if isinstance(mark, Dots):
-            _draw_dots(ax, mark, np.array([categories.index(label) for label in mark.labels]) + offset)
-        elif isinstance(mark, Bars):
+    for mark in panel.marks:
+        if isinstance(mark, Bars):
             rows = [categories.index(label) for label in mark.labels]
             bar: dict[str, Any] = {"color": mark.colour, "edgecolor": "white", "linewidth": 0.6}
             ax.barh(rows, mark.values, 0.65, left=left[rows], label=mark.name, **bar)
@@ -119,17 +114,6 @@ def _draw(ax: Axes, panel: Panel, loc: Any, width: int) -> None:
     if not categories and not panel.log_y:
         ax.ticklabel_format(axis="y", useOffset=False)
     ax.tick_params(labelbottom=panel.x_ticks)
-
-
-def _draw_dots(ax: Axes, mark: Dots, rows: np.ndarray) -> None:
-    values = np.asarray(mark.values, dtype=float)
-    error = None
-    if len(mark.low):
-        error = np.maximum([values - np.asarray(mark.low), np.asarray(mark.high) - values], 0.0)
-    marker, size = _MARKERS[mark.style]
-    ax.errorbar(
-        values, rows, xerr=error, fmt=marker, color=mark.colour, markersize=size, capsize=3, label=mark.name or None
-    )
 
 
 def _draw_mark(ax: Axes, mark: Mark) -> None:

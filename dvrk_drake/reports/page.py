@@ -89,6 +89,7 @@ class Table:
         show: Where the table is shown.
         folded: Whether a page shows only the caption until the reader opens the table.
         right: Whether each column is aligned right. None: columns in which all cells are numbers are.
+        name: Name of the CSV file without suffix, if the page is written with its tables.
     """
 
     header: Sequence[str]
@@ -98,6 +99,7 @@ class Table:
     show: Show = "always"
     folded: bool = False
     right: Sequence[bool] | None = None
+    name: str = ""
 
     def __post_init__(self) -> None:
         """Raises ValueError if a row has another number of cells than the header."""
@@ -186,6 +188,11 @@ class Section:
     blocks: Sequence[Block]
     note: str = ""
     folded: bool = False
+
+    @property
+    def finding(self) -> str:
+        """First text of the section. "" if it does not begin with a text."""
+        return self.blocks[0].text if self.blocks and isinstance(self.blocks[0], Text) else ""
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,9 @@ from dvrk_drake.analysis.payload import (
     equally_good_links,
 )
 from dvrk_drake.models.locked_joints import locked_option
-from dvrk_drake.reports.colours import FITTED, HELD_OUT
+from dvrk_drake.reports.colours import FITTED
 from dvrk_drake.reports.page import Block, Page, Plot, Section, Table, Text
-from dvrk_drake.reports.plot import Dots, Style, category_panel
+from dvrk_drake.reports.plot import Bars, category_panel
 
 
 def payload_page(result: PayloadIdentification, *, model_path: str | None = None, options: str = "") -> Page:
@@ -56,7 +56,7 @@ def payload_page(result: PayloadIdentification, *, model_path: str | None = None
         answer,
         [
             Section("Estimate", estimate),
-            Section("Links", [_link_plot(estimates, payload), _link_table(estimates)]),
+            Section("Links", [_link_table(estimates)]),
             *([Section("Efforts", [_effort_plot(payload), _effort_table(payload)])] if payload.found else []),
         ],
         "good" if clear else "warning",
@@ -135,30 +135,9 @@ def _none_found(payload: Payload, elsewhere: Sequence[Payload]) -> str:
     return answer + f"The mass of a payload at the centre of mass of the link is below {largest}."
 
 
-def _link_plot(estimates: Sequence[Payload], chosen: Payload) -> Plot:
-    """Returns the mass with its interval for a payload on each link on which one was found."""
-    dots = []
-    cases: tuple[tuple[str, Style, list[Payload]], ...] = (
-        (chosen.link, "diamonds", [chosen]),
-        ("other links", "circles", [payload for payload in estimates if payload is not chosen]),
-    )
-    for name, style, shown in cases:
-        mass = [p.body.mass if p.found else float("nan") for p in shown]
-        reach = [p.quantile * p.mass_error for p in shown]
-        low, high = ([m + sign * r for m, r in zip(mass, reach, strict=True)] for sign in (-1, 1))
-        dots.append(Dots(name, [p.link for p in shown], mass, FITTED, low, high, style))
-    label = f"mass with {100 * CONFIDENCE:.0f} % interval [kg]"
-    caption = "Mass of a payload on each link; no dot: no payload found"
-    return Plot("links", caption, [category_panel("", dots, label)])
-
-
 def _effort_plot(payload: Payload) -> Plot:
-    """Returns the effort of the payload and the residual, as shares of the RMS change of the efforts."""
-    moved = [a for a in payload.actuators if a.change]
-    names = [a.name for a in moved]
-    dots = [
-        Dots("payload", names, [100 * a.payload / a.change for a in moved], FITTED),
-        Dots("residual", names, [100 * a.left / a.change for a in moved], HELD_OUT, style="diamonds"),
-    ]
-    panel = category_panel("", dots, "RMS effort / RMS change of the effort [%]")
-    return Plot("efforts", f"Share of the change that a payload on {payload.link} explains", [panel])
+    """Returns the share of the change of the efforts that the payload explains."""
+    loaded = {a.name: a.explained for a in payload.actuators if a.explained is not None}
+    bars = Bars("explained", list(loaded), [100 * max(share, 0.0) for share in loaded.values()], FITTED)
+    panel = category_panel("", [bars], "explained share of the squared change [%]")
+    return Plot("efforts", f"Change of the efforts that a payload on {payload.link} explains", [panel])

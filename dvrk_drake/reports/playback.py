@@ -1,9 +1,12 @@
-"""3D animation of a recording for a report."""
+"""3D animation of a recording or of a simulation for a report."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.geometry import MeshcatAnimation, Rgba
 
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.systems.arm_view.drawn_arm import DrawnArm
@@ -12,6 +15,8 @@ from dvrk_drake.systems.arm_view.page import page_html, start_meshcat
 
 #: Largest rate [Hz] and largest number of key frames. Meshcat interpolates between key frames.
 MAX_RATE, MAX_FRAMES = 30.0, 400
+#: Name and colour of the second arm: that of the model of the SDF in the plots.
+_GHOST, _GHOST_COLOUR = "ghost", Rgba(0.17, 0.67, 0.4, 0.5)
 
 
 def frame_times(start: float, end: float) -> NDArray[np.float64]:
@@ -20,30 +25,60 @@ def frame_times(start: float, end: float) -> NDArray[np.float64]:
     return np.linspace(start, end, max(count, 2))
 
 
-def playback(arm: Arm, t: NDArray[np.float64], q: NDArray[np.float64], tau: NDArray[np.float64]) -> str:
-    """Returns a page of Meshcat with an animation of the arm and its efforts. It starts at t[0].
+def playback(
+    arm: Arm,
+    t: NDArray[np.float64],
+    q: NDArray[np.float64],
+    tau: NDArray[np.float64] | None = None,
+    *,
+    ghost: NDArray[np.float64] | None = None,
+    phases: Sequence[tuple[float, str]] = (),
+    colors: Mapping[str, str] | None = None,
+    title: str = "",
+) -> str:
+    """Returns a page of Meshcat with an endless animation of the arm. It starts at t[0].
 
     Args:
         arm: Arm to draw.
         t: Times (m,) of the poses, increasing [s].
         q: Poses (m, n) of the joints [rad, m].
-        tau: Efforts (m, n) of the joints [N m, N].
+        tau: Efforts (m, n) of the joints [N m, N]. None: they are not drawn.
+        ghost: Poses (m, n) of a second, translucent arm [rad, m]. None: there is no second arm.
+        phases: Start times [s] of the phases, and their names.
+        colors: CSS colours and their meanings, see `page_html`.
+        title: Title of the page. "": the name of the arm.
 
     Raises:
         ArmError: The arm has no visual geometry.
         DvrkDrakeError: No port of this computer is free.
     """
     times = frame_times(float(t[0]), float(t[-1]))
-    poses, efforts = (np.column_stack([np.interp(times, t, x) for x in values.T]) for values in (q, tau))
+    poses, efforts, ghosts = (
+        None if values is None else np.column_stack([np.interp(times, t, x) for x in values.T])
+        for values in (q, tau, ghost)
+    )
+    assert poses is not None
     period = float(times[1] - times[0])
     meshcat = start_meshcat(arm)
     links, overlay = DrawnArm(arm, meshcat, f"{arm.name.lower()}/links"), ArmOverlay(arm, meshcat)
+    if ghosts is not None:
+        overlay.add_ghost(_GHOST, _GHOST_COLOUR)
     meshcat.StartRecording(frames_per_second=1 / period)
-    for k, (pose, effort) in enumerate(zip(poses, efforts, strict=True)):
+    for k, pose in enumerate(poses):
         # The time is in the middle of the frame, so that rounding does not change the number of the frame.
         time = (k + 0.5) * period
         links.draw(pose, time)
-        overlay.draw(pose, effort=effort, time=time)
+        overlay.draw(
+            pose,
+            effort=None if efforts is None else efforts[k],
+            ghosts=None if ghosts is None else {_GHOST: ghosts[k]},
+            time=time,
+        )
+    overlay.end_recording(time)
     meshcat.StopRecording()
+    animation = meshcat.get_mutable_recording()
+    animation.set_loop_mode(MeshcatAnimation.LoopMode.kLoopRepeat)
+    animation.set_repetitions(10_000)
     meshcat.PublishRecording()
-    return page_html(meshcat, arm.name, effort_scale=True)
+    relative = [(start - float(t[0]), text) for start, text in phases]
+    return page_html(meshcat, title or arm.name, phases=relative, colors=colors, effort_scale=tau is not None)

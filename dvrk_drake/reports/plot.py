@@ -59,28 +59,6 @@ class Band:
 
 
 @dataclass(frozen=True, eq=False)
-class Dots:
-    """Values of categories with intervals, drawn horizontally.
-
-    Attributes:
-        name: Name in the legend. "": no entry.
-        labels: Categories (m,).
-        values: Values (m,). nan: not drawn.
-        colour: Colour as "#rrggbb".
-        low, high: Ends (m,) of the intervals. Empty: no intervals.
-        style: Symbol.
-    """
-
-    name: str
-    labels: Sequence[str]
-    values: Values
-    colour: str
-    low: Values = ()
-    high: Values = ()
-    style: Style = "circles"
-
-
-@dataclass(frozen=True, eq=False)
 class Bars:
     """Horizontal bars of categories. The bars of all marks of a panel are stacked.
 
@@ -120,7 +98,7 @@ class Guide:
     dashed: bool = True
 
 
-Mark = Curve | Band | Dots | Bars | Guide
+Mark = Curve | Band | Bars | Guide
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,8 +128,8 @@ class Panel:
 
     @property
     def categories(self) -> list[str]:
-        """Categories of the dots and bars, the first one at the top."""
-        return list(dict.fromkeys(label for m in self.marks if isinstance(m, Dots | Bars) for label in m.labels))
+        """Categories of the bars, the first one at the top."""
+        return list(dict.fromkeys(label for m in self.marks if isinstance(m, Bars) for label in m.labels))
 
 
 def series(i: int) -> dict[str, Any]:

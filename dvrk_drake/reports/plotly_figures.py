@@ -11,7 +11,7 @@ from plotly.subplots import make_subplots
 
 from dvrk_drake.reports.colours import SERIES
 from dvrk_drake.reports.page import Plot
-from dvrk_drake.reports.plot import Band, Bars, Curve, Dots, Guide, Mark, Panel, Values
+from dvrk_drake.reports.plot import Band, Bars, Curve, Guide, Mark, Panel, Values
 
 #: Fonts of the page and of its plots. No font is loaded.
 FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Noto Sans', 'DejaVu Sans', sans-serif"
@@ -57,6 +57,8 @@ TEMPLATE = go.layout.Template(
         },
         "colorway": list(SERIES),
         "annotationdefaults": {"font": {"size": 13}},
+        # Beside the plot, so that the buttons do not cover the legend.
+        "modebar": {"orientation": "v", "bgcolor": "rgba(0,0,0,0)"},
         "xaxis": _AXIS,
         "yaxis": _AXIS,
     }
@@ -98,7 +100,7 @@ def plotly_figure(plot: Plot) -> go.Figure:
     return figure.update_layout(
         template=TEMPLATE,
         height=inside + top + _BOTTOM,
-        margin={"l": 64, "r": 24, "t": top, "b": _BOTTOM},
+        margin={"l": 64, "r": 44, "t": top, "b": _BOTTOM},
         barmode="stack",
         bargap=0.3,
         showlegend=bool(names),
@@ -159,17 +161,6 @@ def _traces(mark: Mark, entry: dict[str, Any]) -> list[go.Scatter | go.Bar]:
         hover = {"hovertext": list(mark.texts), "hoverinfo": "text"} if mark.texts else {}
         style = {"color": mark.colour, "line": {"color": "white", "width": 1}}
         return [go.Bar(y=list(mark.labels), x=mark.values, orientation="h", marker=style, **hover, **entry)]
-    if isinstance(mark, Dots):
-        values = np.asarray(mark.values, dtype=float)
-        error = None
-        if len(mark.low):
-            error = {
-                "array": np.maximum(np.asarray(mark.high) - values, 0.0),
-                "arrayminus": np.maximum(values - np.asarray(mark.low), 0.0),
-                "thickness": 2,
-                "width": 5,
-            }
-        return [go.Scatter(x=values, y=list(mark.labels), error_x=error, **_look(mark.style, mark.colour), **entry)]
     assert isinstance(mark, Curve)
     hover = {"text": list(mark.texts), "hovertemplate": "%{text}"} if mark.texts else {}
     return [go.Scatter(x=_compact(mark.x), y=_compact(mark.y), **_look(mark.style, mark.colour), **hover, **entry)]

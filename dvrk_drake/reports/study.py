@@ -13,7 +13,7 @@ from dvrk_drake.experiments.study.table import Row, Share, Summary, summarise, v
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.reports.colours import SERIES
 from dvrk_drake.reports.page import Block, Page, Plot, Section, Table, Text
-from dvrk_drake.reports.plot import Curve, Dots, Panel, category_panel
+from dvrk_drake.reports.plot import Bars, Curve, Panel, category_panel
 
 #: Maximum number of variations in the answer, and of failed runs that a terminal lists without --verbose.
 _MAX_COUNT = 3
@@ -51,10 +51,7 @@ def study_page(study: Study, rows: Mapping[int, Row], *, study_path: str | None 
     if len(failed) > _MAX_COUNT:
         blocks.append(Text(f"{len(failed)} runs failed. --verbose lists all.", "warning", show="brief"))
     panels = [_panel(measure, study, rows, summaries) for measure in study.measures]
-    caption = (
-        f"Results of {len(rows)} runs. Shares with 95 % Wilson interval. Cumulative shares are better if they rise "
-        "further left"
-    )
+    caption = f"Results of {len(rows)} runs. Cumulative shares are better if they rise further left"
     return Page(
         f"Study of {study.arm.name}, scenario {study.scenario}",
         f"{first.column} {found}. {len(rows)} of {len(study.cases)} runs, {len(failed)} failed.",
@@ -129,13 +126,14 @@ def _panel(measure: Measure, study: Study, rows: Mapping[int, Row], summaries: S
 
 
 def _share_panel(measure: Measure, summaries: Sequence[Summary]) -> Panel:
-    dots = []
+    bars = []
     for i, summary in enumerate(summaries):
         share = summary.measures[measure.column]
         assert isinstance(share, Share)
         value, low, high = (100 * x for x in (share.count / share.runs, share.lower, share.upper))
-        dots.append(Dots("", [summary.variation], [value], SERIES[i % len(SERIES)], [low], [high]))
-    return category_panel(_title(measure), dots, "share of runs [%]", x_range=(-3.0, 103.0))
+        text = f"{value:.1f} %, 95 % interval {low:.1f}..{high:.1f} %"
+        bars.append(Bars("", [summary.variation], [value], SERIES[i % len(SERIES)], [text]))
+    return category_panel(_title(measure), bars, "share of runs [%]", x_range=(0.0, 103.0))
 
 
 def _title(measure: Measure) -> str:

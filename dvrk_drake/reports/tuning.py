@@ -36,7 +36,7 @@ def tuning_page(tuning: Tuning, *, gains_path: str | None = None) -> Page:
         details += _procedure_tables(tuning.arm, tuning.procedure)
     if tuning.design is not None:
         details += _design_tables(tuning.arm, tuning.design)
-    details += [*_joint_tables(comparison), _pose_table(comparison)]
+    details += _joint_tables(comparison)
     plots = [_step_plot(comparison), _effort_plot(comparison)] if comparison.responses else []
     return Page(
         f"Controller gains of {tuning.arm.name}, simulated",
@@ -45,7 +45,7 @@ def tuning_page(tuning: Tuning, *, gains_path: str | None = None) -> Page:
         [
             Section("Comparison of the gains", [_summary_table(comparison)]),
             Section("Step responses", plots),
-            Section("Tuning methods, joints and poses", details, folded=True),
+            Section("Tuning methods and joints", details, folded=True),
         ],
         "good" if is_better else "warning",
         f"dvrk-drake simulate tune --arm {name} --output GAINS.yaml"
@@ -157,20 +157,6 @@ def _joint_tables(comparison: Comparison) -> list[Block]:
         header = ("", *names, "overshoot", f"error [{unit}]", "ripple")
         blocks.append(Table(header, rows, title, show="details"))
     return blocks
-
-
-def _pose_table(comparison: Comparison) -> Table:
-    rows = [
-        (
-            " ".join(f"{x:.2f}" for x in q),
-            *(_settled(comparison.table(which, "settling")[0, p]) for which in comparison.gains),
-        )
-        for p, q in enumerate(comparison.poses)
-    ]
-    caption = "Number of settled joints by pose [rad; m], mean settling time"
-    return Table(
-        ("pose", *comparison.gains), rows, caption, show="details", right=[False, *len(comparison.gains) * [True]]
-    )
 
 
 def _slowest(settling: NDArray[np.float64]) -> str:

@@ -12,7 +12,7 @@ from dvrk_drake.cli import main
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ModelError
-from dvrk_drake.experiments.ground_truth import collect_static_poses, perturbed_links, with_links
+from dvrk_drake.experiments.ground_truth import perturbed_arm, simulate_poses
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import ArmEffects, DriveEffect
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions, set_joint_damping
@@ -32,8 +32,7 @@ def arm():
 
 @pytest.fixture(scope="module")
 def ground_truth_arm(arm, tmp_path_factory):
-    links = perturbed_links(arm, np.random.default_rng(5), shift=0.002)
-    return with_links(arm, links, tmp_path_factory.mktemp("ground_truth_arm") / "psm.sdf", "a test")
+    return perturbed_arm(arm, tmp_path_factory.mktemp("ground_truth_arm") / "psm.sdf", 5, max_shift=0.002)
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +50,7 @@ def recording(arm, ground_truth_arm):
         effects=ArmEffects(cables=laws),
     )
     poses = arm.sample_poses(COUNT, generator, margin=0.1)
-    return collect_static_poses(station, IdentifiedModel.from_arm(arm), poses)
+    return simulate_poses(station, IdentifiedModel.from_arm(arm), poses)
 
 
 def true_torque(arm, ground_truth_arm, poses):

@@ -24,7 +24,7 @@ COMMANDS = {
         ["--arm", "mtml", "--output", "o.yaml", "--plots", "new/p"],
         "experiments.tuning.tuning.tune_arm",
     ),
-    "reproduce": (["fig7", "--folder", "new/p"], "reports.reproduction.run.reproduce"),
+    "reproduce": (["fig7", "--folder", "new/p"], "reports.reproduction.page.reproduce"),
 }
 
 

@@ -1,7 +1,6 @@
 """Reproduction of the paper: published numbers, simulations with known solutions, pages, and errors."""
 
 import csv
-import dataclasses
 import re
 from concurrent.futures import ThreadPoolExecutor
 from typing import get_args, get_type_hints
@@ -9,25 +8,18 @@ from typing import get_args, get_type_hints
 import numpy as np
 import pytest
 from command_output import refusal
+from figure_rules import checked_figures
 from paper_regressor import paper_regressor
 
 from dvrk_drake.cli import main
 from dvrk_drake.cli.demo import reproduce as command
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import DvrkDrakeError, RecordingError
-from dvrk_drake.experiments.ground_truth import GroundTruth, perturbed_ground_truth
-from dvrk_drake.experiments.reproduction import published
-from dvrk_drake.experiments.reproduction.drift_experiment import (
-    BAND,
-    SAMPLE_PERIOD,
-    Drifts,
-    Release,
-    release,
-    release_all,
-)
-from dvrk_drake.experiments.reproduction.mechanisms import mechanism_errors, published_row, recomputed_table
+from dvrk_drake.experiments.ground_truth import perturbed_arm
+from dvrk_drake.experiments.releases import BAND, SAMPLE_PERIOD, Drifts, release, release_all
+from dvrk_drake.experiments.reproduction.mechanisms import mechanism_errors, recomputed_table
 from dvrk_drake.experiments.reproduction.published import (
-    PAPER_ARM,
+    PAPER,
     PaperRecordings,
     paper_model,
     paper_torque,
@@ -46,17 +38,17 @@ from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_sele
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.reports.colours import MEASURED
-from dvrk_drake.reports.page import Plot
+from dvrk_drake.reports.image_files import write_images
+from dvrk_drake.reports.page import Page, Plot, Section, Table, Text
 from dvrk_drake.reports.plot import Curve, Panel
 from dvrk_drake.reports.provenance import Provenance
-from dvrk_drake.reports.reproduction import run
-from dvrk_drake.reports.reproduction.drift import reproduce_figure_5
-from dvrk_drake.reports.reproduction.mechanisms import reproduce_table_1
-from dvrk_drake.reports.reproduction.page import ResultTable, Section, share, write_page
-from dvrk_drake.reports.reproduction.run import NAMES, reproduce
-from dvrk_drake.reports.reproduction.transparency import reproduce_transparency
+from dvrk_drake.reports.reproduction import drift, figures
+from dvrk_drake.reports.reproduction import page as reproduction_page
+from dvrk_drake.reports.reproduction.drift import reproduce_figure_5, share
+from dvrk_drake.reports.reproduction.figures import reproduce_transparency
+from dvrk_drake.reports.reproduction.page import NAMES, reproduce, write_page
 
-ARM = load_arm(PAPER_ARM)
+ARM = load_arm(PAPER.arm)
 
 
 # Table I.
@@ -64,7 +56,7 @@ ARM = load_arm(PAPER_ARM)
 
 def test_dh_table_of_plant_matches_paper():
     table, worst = recomputed_table(ARM)
-    expected = np.array([published_row(row) for row in published.TABLE_1])
+    expected = np.array(PAPER.table_1, float)
     assert worst < 1e-12
     np.testing.assert_allclose(np.exp(1j * table[:, [1, 3]]), np.exp(1j * expected[:, [1, 3]]), atol=1e-9)
     np.testing.assert_allclose(table[:, [0, 2, 4]], expected[:, [0, 2, 4]], atol=1e-9)
@@ -73,10 +65,10 @@ def test_dh_table_of_plant_matches_paper():
 # The paper's parameters.
 
 
-@pytest.mark.parametrize("parameters", [published.PARAMETERS, tuple(np.linspace(-1, 2, 12))])
+@pytest.mark.parametrize("parameters", [PAPER.parameters, tuple(np.linspace(-1, 2, 12))])
 def test_paper_torque_matches_its_regressor(parameters):
     q = ARM.sample_poses(30, np.random.default_rng(2))
-    expected = [published.CONTROL_GRAVITY * paper_regressor(pose) @ parameters for pose in q]
+    expected = [PAPER.control_gravity * paper_regressor(pose) @ parameters for pose in q]
     np.testing.assert_allclose(paper_torque(ARM, q, parameters), expected, atol=1e-11)
 
 
@@ -92,10 +84,10 @@ def test_paper_model_and_zero_torque_of_joints():
 
 def test_published_parameters_are_least_squares_solution(shared_data):
     recording = read_recording(shared_data / "mtm_static/mtm_2015_good72.csv")
-    Y = published.IDENTIFICATION_GRAVITY * np.array([paper_regressor(pose) for pose in recording.q])
+    Y = PAPER.identification_gravity * np.array([paper_regressor(pose) for pose in recording.q])
     fitted = np.linalg.lstsq(Y.reshape(-1, 12), recording.measured_effort().ravel(), rcond=None)[0]
     # The parameters are published to four digits. The last one differs in the team's file (.0008).
-    np.testing.assert_allclose(published.PARAMETERS[:-1], fitted[:-1], atol=5.1e-5)
+    np.testing.assert_allclose(PAPER.parameters[:-1], fitted[:-1], atol=5.1e-5)
     assert fitted[-1] == pytest.approx(0.0008, abs=5e-5)
 
 
@@ -104,17 +96,17 @@ def test_published_parameters_are_least_squares_solution(shared_data):
 
 def test_published_means_match_data(shared_data):
     figure_4 = PaperRecordings.find(shared_data / "mtm_static").figure_4
-    np.testing.assert_allclose(published.FIGURE_4_MEANS, figure_4.mean(axis=0), rtol=3e-3, atol=0)  # three digits
+    np.testing.assert_allclose(PAPER.figure_4_means, figure_4.mean(axis=0), rtol=3e-3, atol=0)  # three digits
     with open(shared_data / "mtm_static/paper_fig5_fig6_drift_trials.csv") as stream:
         rows = list(csv.reader(stream))[1:]
     final = {row[0]: np.array(row[1:7], float) for row in rows}
     # The values are digitised from plots and rounded.
-    np.testing.assert_allclose(published.FIGURE_5[:5], final["Errors8_FullTorques"][:5], atol=6e-4)
-    np.testing.assert_allclose(published.FIGURE_6, final["Errors1"], atol=6e-4)
+    np.testing.assert_allclose(PAPER.figure_5[:5], final["Errors8_FullTorques"][:5], atol=6e-4)
+    np.testing.assert_allclose(PAPER.figure_6, final["Errors1"], atol=6e-4)
     full = [abs(values) for name, values in final.items() if "Full" in name]
     zeroed = [abs(values) for name, values in final.items() if "Full" not in name]
-    np.testing.assert_allclose(published.FIGURE_5_MEANS, np.mean(full, axis=0), atol=6e-3)
-    np.testing.assert_allclose(published.FIGURE_6_MEANS, np.mean(zeroed, axis=0), atol=6e-3)
+    np.testing.assert_allclose(PAPER.figure_5_means, np.mean(full, axis=0), atol=6e-3)
+    np.testing.assert_allclose(PAPER.figure_6_means, np.mean(zeroed, axis=0), atol=6e-3)
 
 
 # Errors.
@@ -157,34 +149,30 @@ def test_rejects_unknown_figures(tmp_path):
 
 
 def test_page_links_its_tables_and_figures(tmp_path):
-    table = ResultTable("numbers", "Numbers", ("", "J1"), (("ours", "1"), ("theirs", "a, b")))
+    table = Table(("", "J1"), (("ours", "1"), ("theirs", "a, b")), "Numbers", name="numbers")
     plot = Plot("x", "Seen", [Panel("", [Curve("", [0, 1], [0, 1], MEASURED)], "q [rad]", "tau [N m]")])
-    section = Section("x", "Fig. 9: a, b", "Found.", ("**Said** `so`.",), (table,), (plot,))
-    text = write_page(tmp_path, [section], ["a reason"], Provenance.of()).read_text()
+    section = Section("Fig. 9: a, b", [Text("Found."), table, plot, Text("**Said** `so`.")])
+    write_page(tmp_path, [section], ["a reason"], Provenance.of())
+    text = (tmp_path / "index.html").read_text()
     assert '<a href="#section-2">Fig. 9: a, b</a>' in text
     assert "<figcaption>Seen</figcaption>" in text and (tmp_path / "x.png").read_bytes().startswith(b"\x89PNG")
-    assert text.index("Found.") < text.index("numbers.csv") < text.index("<strong>Said</strong> <code>so</code>.")
+    assert text.index("Found.") < text.index("Numbers") < text.index("<strong>Said</strong> <code>so</code>.")
     assert "1 of 2 requested results were computed." in text and "Missing: a reason" in text
     assert "reproduce all --folder reproduction --data FOLDER" in text
     with open(tmp_path / "numbers.csv") as stream:
         assert list(csv.reader(stream)) == [["", "J1"], ["ours", "1"], ["theirs", "a, b"]]
 
 
-def test_page_with_table_1_only(no_recordings, tmp_path):
-    page = write_page(tmp_path, [reproduce_table_1()], [], Provenance.of())
-    assert re.search(r"L3 = 0.3645</td><td[^>]*>0.3645<", page.read_text())
-    assert (tmp_path / "table1.csv").stat().st_size > 0
-
-
 def test_finished_figures_are_written_if_others_fail(no_recordings, monkeypatch, tmp_path):
     def fail(session):
         raise KeyboardInterrupt
 
-    monkeypatch.setitem(run._MAKERS, "fig7", fail)
+    monkeypatch.setitem(reproduction_page._MAKERS, "fig7", fail)
     with pytest.raises(KeyboardInterrupt):
-        run.reproduce(["table1", "fig7"], tmp_path, PaperRecordings(None))
+        reproduce(["table1", "fig7"], tmp_path, PaperRecordings(None))
     page = (tmp_path / "index.html").read_text()
-    assert "L3 = 0.3645" in page and "fig7 was not finished" in page
+    assert re.search(r"L3 = 0.3645</td><td[^>]*>0.3645<", page) and "fig7 was not finished" in page
+    assert (tmp_path / "table1.csv").stat().st_size > 0
 
 
 def test_shares_have_wilson_interval():
@@ -216,32 +204,32 @@ def test_joint_is_held_if_it_never_leaves_band():
 @pytest.fixture(scope="module")
 def truth(tmp_path_factory):
     """Ground-truth arm, derived and compiled once."""
-    return perturbed_ground_truth(PAPER_ARM, tmp_path_factory.mktemp("truth"), seed=8)
+    arm = perturbed_arm(ARM, tmp_path_factory.mktemp("truth") / "mtm.sdf", 8, without=PAPER.without)
+    return IdentifiedArm(arm, "", Recording(q=np.zeros((1, 7))), IdentifiedModel.from_arm(ARM))
 
 
 @pytest.mark.slow
-def test_exact_model_holds_arm_and_zero_torque_does_not(truth, tmp_path):
-    exact, nothing = tmp_path / "exact.yaml", tmp_path / "nothing.yaml"
-    truth.model.save(exact)
-    with_zero_torque(truth.model, range(7)).save(nothing)
+def test_exact_model_holds_arm_and_zero_torque_does_not(truth):
     start = ARM.sample_poses(1, np.random.default_rng(5), margin=0.2)[0]
-    cases = [Release(PAPER_ARM, truth.arm, ("all",), str(model), start, duration=1.0) for model in (exact, nothing)]
     with ThreadPoolExecutor(1) as executor:
-        held, fallen = release_all(cases, executor)
+        held, fallen = (
+            release_all(truth.arm, model, start[None], executor, duration=1.0).positions[0]
+            for model in (truth.exact, with_zero_torque(truth.exact, range(7)))
+        )
     assert held.shape == (round(1.0 / SAMPLE_PERIOD) + 1, 7)
     np.testing.assert_allclose(held[0], start, atol=1e-12)
     assert np.abs(held - start).max() < 2e-3  # the only errors are a delay and the encoder resolution
     assert np.abs(fallen[-1] - start)[1] > 0.1
-    np.testing.assert_array_equal(release(cases[0]), held)  # bit for bit
+    np.testing.assert_array_equal(release(truth.arm, truth.exact, start, duration=1.0), held)  # bit for bit
 
 
 @pytest.mark.slow
 def test_ground_truth_arm_matches_its_model(truth):
     q = ARM.sample_poses(20, np.random.default_rng(7))
-    effects = truth.model.holding_torque(q) - IdentifiedModel.from_arm(truth.arm).holding_torque(q)
+    effects = truth.exact.holding_torque(q) - IdentifiedModel.from_arm(truth.arm).holding_torque(q)
     assert np.abs(effects[:, 3]).max() > 0.01  # cables
     nominal = IdentifiedModel.from_arm(ARM).holding_torque(q)
-    assert np.abs(truth.model.holding_torque(q) - effects - nominal).max() > 0.02  # differs from the nominal model
+    assert np.abs(truth.exact.holding_torque(q) - effects - nominal).max() > 0.02  # differs from the nominal model
 
 
 def test_positions_in_damping_term_leave_joint_undamped(tmp_path):
@@ -252,73 +240,74 @@ def test_positions_in_damping_term_leave_joint_undamped(tmp_path):
     assert np.argmax(np.abs(shapes[:, undamped[0]])) == 6  # only joint 7
     assert correct.real.max() < -0.01
     # Link inertias of 1 kg m^2 reproduce the published period of J2, within the accuracy of a digitised plot.
-    assert longest_period(arm) == pytest.approx(published.FIGURE_7_VALUES["J2 period"], rel=0.25)
+    assert longest_period(arm) == pytest.approx(PAPER.period_2, rel=0.25)
 
 
 def test_paper_controller_moves_its_arm_to_zero(tmp_path):
     arm = paper_simulated_arm(ARM, tmp_path / "paper.sdf")
     q = simulate_paper_controller(arm, 0.1, faulty=True)
     assert q.shape == (round(0.1 / PERIOD) + 1, 7)
-    np.testing.assert_allclose(q[0, :5], published.FIGURE_7_START[:5], atol=1e-12)
+    np.testing.assert_allclose(q[0, :5], PAPER.start[:5], atol=1e-12)
     # With exact gravity compensation and at rest, initially M qdd = -(Kp, plus Kv of the faulty joints) q.
     plant = make_arm_plant(arm)
     context = plant.CreateDefaultContext()
     set_arm_positions(plant, context, arm, q[0])
     tree, G = tree_selector(plant, arm), arm.linkage.matrix
     M = G.T @ plant.CalcMassMatrix(context)[np.ix_(tree, tree)] @ G
-    stiffness = np.array(published.FIGURE_7_KP)
-    stiffness[4:] += published.FIGURE_7_KV[4:]
+    stiffness = np.array(PAPER.kp)
+    stiffness[4:] += PAPER.kv[4:]
     steps = PERIOD / 1e-3  # of the plant: it moves by dt^2 (1 + 2 + .. + steps) qdd
     moved = 1e-6 * steps * (steps + 1) / 2 * -np.linalg.solve(M, stiffness * q[0])
     np.testing.assert_allclose(q[1] - q[0], moved, rtol=0.02, atol=1e-7)
 
 
 def test_psm_remote_centre_and_wrist_axes():
-    remote, angle = mechanism_errors(load_arm("psm"))
+    remote, angle = mechanism_errors(load_arm(PAPER.second_arm), PAPER.remote_axis, PAPER.wrist_axes)
     assert remote < 1e-9
     assert angle == pytest.approx(np.pi / 2, abs=1e-9)
 
 
 @pytest.mark.slow
-def test_hysteresis_compensation_holds_arm_after_approach(tmp_path):
-    arm = load_arm(PAPER_ARM)
-    truth, exact = GroundTruth(arm, IdentifiedModel.from_arm(arm), False, ""), tmp_path / "exact.yaml"
-    truth.model.save(exact)
+def test_hysteresis_compensation_holds_arm_after_approach():
+    exact = IdentifiedModel.from_arm(ARM)
     start = ARM.sample_poses(1, np.random.default_rng(10), margin=0.2)[0]
-    case = Release(PAPER_ARM, arm, ("friction",), str(exact), start, approach="regulated", duration=1.5, seed=10)
-    with ThreadPoolExecutor(1) as executor:
-        uncompensated, compensated = (
-            Drifts(arm, positions[None]).largest[0]
-            for positions in release_all([case, dataclasses.replace(case, hysteresis_ratio=0.9)], executor)
-        )
+    uncompensated, compensated = (
+        np.abs(q - q[0]).max(axis=0)
+        for ratio in (0.0, 0.9)
+        for q in [
+            release(
+                ARM, exact, start, effects=("friction",), approach=True, hysteresis_ratio=ratio, duration=1.5, seed=10
+            )
+        ]
+    )
     assert np.all(uncompensated[1:3] > 0.04) and np.all(compensated < BAND[0])
 
 
 def exact_session(truth, folder, executor, sample_sizes):
     """Returns a session with an exactly identified MTM."""
-    file = folder / "exact.yaml"
-    truth.model.save(file)
     q = ARM.sample_poses(20, np.random.default_rng(9))
-    poses = Recording(q=q, tau=truth.model.holding_torque(q), source="computed")
+    poses = Recording(q=q, tau=truth.exact.holding_torque(q), source="computed")
     session = ReproductionSession(folder, PaperRecordings(None), executor, sample_sizes=sample_sizes)
-    session.__dict__["mtm"] = IdentifiedArm(truth, poses, truth.model, file)
+    session.__dict__["mtm"] = IdentifiedArm(truth.arm, truth.origin, poses, truth.exact)
     return session
 
 
 @pytest.mark.slow
 def test_figure_5_writes_files_and_exact_model_holds(truth, tmp_path):
-    sample_sizes = SampleSizes(releases=3, paper_releases=2, hand_guided_releases=1, duration=1.0)
+    sample_sizes = SampleSizes(releases=3, few_releases=2, duration=1.0)
     with ThreadPoolExecutor(1) as executor:
         section = reproduce_figure_5(exact_session(truth, tmp_path, executor, sample_sizes))
-    page = write_page(tmp_path, [section], [], Provenance.of()).read_text()
-    assert len(section.plots) == 2
-    assert all((tmp_path / f"{plot.name}.png").read_bytes().startswith(b"\x89PNG") for plot in section.plots)
-    drift = {row[0]: row[1:] for row in section.tables[0].rows}
-    assert [float(x) for x in drift["published, five trials (mean)"][1:]] == list(published.FIGURE_5_MEANS)
-    assert drift["ours, share held"] == ("1.000",) * 7
+    write_page(tmp_path, [section], [], Provenance.of())
+    page = (tmp_path / "index.html").read_text()
+    tables, plots = ([block for block in section.blocks if isinstance(block, kind)] for kind in (Table, Plot))
+    assert len(plots) == 2
+    assert all((tmp_path / f"{plot.name}.png").read_bytes().startswith(b"\x89PNG") for plot in plots)
+    drifts = {row[0]: row[1:] for row in tables[0].rows}
+    assert [float(x) for x in drifts["published, five trials (mean)"][1:]] == list(PAPER.figure_5_means)
+    assert drifts["ours, share held"] == ("1.000",) * 7
     assert "3 of 3 (100.0 %" in page
     # The torque of the model is exact, so its error is 0 in the table; that of the paper's method is not.
-    torques = {row[0]: np.array(row[1:], float) for row in section.tables[1].rows}
+    torques = {row[0]: np.array(row[1:], float) for row in tables[1].rows}
     np.testing.assert_array_equal(torques["ours"], 0.0)
     assert torques["the paper's"].max() > 0.01
 
@@ -327,6 +316,35 @@ def test_figure_5_writes_files_and_exact_model_holds(truth, tmp_path):
 def test_compensation_reduces_operator_force(truth, tmp_path):
     with ThreadPoolExecutor(1) as executor:
         section = reproduce_transparency(exact_session(truth, tmp_path, executor, SampleSizes(path_poses=2)))
-    force = [float(row[1]) for row in section.tables[0].rows]
+    _, table, plot, _ = section.blocks
+    force = [float(row[1]) for row in table.rows]
     assert force[0] > force[2] > force[3] > 0  # unpowered, our model, our model with friction compensation
-    assert len(section.plots) == 1
+    assert isinstance(plot, Plot)
+
+
+def test_figure_7_shows_ours_first():
+    t = PERIOD * np.arange(2000)
+    q = np.exp(-t)[:, None] * np.ones(7)
+    plot = figures._steps_plot(ARM, q, q[:1000])
+    assert plot.panels[0].title.startswith("ours")
+    assert {"J7 wrist_roll", "target"} <= {mark.name for mark in plot.panels[0].marks}
+
+
+def linear_drifts(name, size):
+    """Returns ten releases with linear drifts. The largest drifts are between `size` / 10 and `size`."""
+    sizes = size * np.linspace(0.1, 1.0, 10)
+    return Drifts(load_arm(name), sizes[:, None, None] * np.linspace(0, 1, 50)[:, None] * np.ones(7))
+
+
+@pytest.mark.parametrize("name", ["mtml", "psm"])
+def test_distributions_have_one_range_for_all_joints(name, monkeypatch, tmp_path):
+    released = linear_drifts(name, 0.02)
+    plot = drift.largest_drifts_plot("drifts", "test", {"ours": (drift.FITTED, released)})
+    assert len({panel.x_range for panel in plot.panels}) == 1
+    for j, panel in enumerate(plot.panels):
+        curve = panel.marks[0]
+        band = released.arm.per_joint(*BAND)[j]
+        held = curve.y[curve.x <= band].max(initial=0.0)
+        assert held == pytest.approx(100 * released.held[:, j].mean(), abs=1e-9)
+    with checked_figures(monkeypatch):
+        write_images(Page("Reproduction", "", [Section("", [plot])]), tmp_path)

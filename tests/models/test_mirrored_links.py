@@ -12,7 +12,7 @@ from dvrk_drake.analysis.pose_validation import validate_static
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ModelError
-from dvrk_drake.experiments.reproduction.published import PAPER_ARM
+from dvrk_drake.experiments.reproduction.published import PAPER
 from dvrk_drake.export.dvrk_mtm_controller import controller_torque
 from dvrk_drake.export.dvrk_mtm_gravity_compensation import CompensationOptions, compensation_from_model
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation
@@ -63,7 +63,7 @@ def test_wrist_brackets_are_on_the_sides_of_real_arms(shared_data):
 def test_the_papers_recording_is_of_a_right_arm(shared_data):
     """Checks that the model of a right arm predicts the recording better than the mirrored recording."""
     model = identify_static(
-        read_recording(shared_data / "mtm_static/mtmr_2017_coupled12_may10.csv"), load_arm(PAPER_ARM)
+        read_recording(shared_data / "mtm_static/mtmr_2017_coupled12_may10.csv"), load_arm(PAPER.arm)
     ).model
     poses = read_recording(shared_data / "mtm_static/mtm_2015_good72.csv")
     mirrored = dataclasses.replace(poses, q=MIRROR * poses.q, tau=MIRROR * poses.measured_effort())

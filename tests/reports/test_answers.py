@@ -118,7 +118,6 @@ def demonstrated(console, verbose):
         time=t,
         identified=0.005 * q,
         nominal=0.5 * q,
-        descent=0.005,
     )
     print_page(console, demo.demo_page(result, Path("demo_output")), verbose=verbose)
 

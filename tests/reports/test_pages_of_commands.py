@@ -27,7 +27,7 @@ from dvrk_drake.reports.html_file import render_html, write_html
 from dvrk_drake.reports.image_files import write_images
 from dvrk_drake.reports.page import Plot, Table
 from dvrk_drake.reports.payload import payload_page
-from dvrk_drake.reports.plot import Curve, Dots, Guide
+from dvrk_drake.reports.plot import Bars, Curve, Guide
 from dvrk_drake.reports.provenance import Provenance
 from dvrk_drake.reports.study import study_page
 from dvrk_drake.reports.transparency import transparency_page
@@ -92,7 +92,7 @@ def test_study_plots_show_all_runs_and_name_infinite_values():
     cases = [[c.index for c in study.cases if c.variation == v.name] for v in study.variations]
     held = [np.mean([rows[k].values.get("held", False) for k in indices]) for indices in cases]
     np.testing.assert_allclose([mark.values[0] for mark in share.marks], [100 * x for x in held], atol=1e-9)
-    assert all(isinstance(mark, Dots) and mark.low[0] < mark.values[0] < mark.high[0] for mark in share.marks)
+    assert all(isinstance(mark, Bars) and "95 % interval" in mark.texts[0] for mark in share.marks)
     assert sum(len(mark.x) for mark in drift.marks) == len(rows) - 1
     assert "1 of 24 are infinite" in drift.title
 

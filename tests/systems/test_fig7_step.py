@@ -9,7 +9,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.experiments.reproduction.published import FIGURE_7_START
+from dvrk_drake.experiments.reproduction.published import PAPER
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
@@ -45,8 +45,8 @@ def simulate(q0, q_desired, duration, gravity_factor=1.0):
 
 @pytest.mark.parametrize("gravity_factor", [1.2, *(pytest.param(f, marks=pytest.mark.slow) for f in (1.0, 0.8))])
 def test_every_joint_settles(gravity_factor):
-    t, error, effort = simulate(np.array(FIGURE_7_START), np.zeros(7), 6.0, gravity_factor)
-    np.testing.assert_allclose(error[0], FIGURE_7_START, atol=1e-12)
+    t, error, effort = simulate(np.array(PAPER.start), np.zeros(7), 6.0, gravity_factor)
+    np.testing.assert_allclose(error[0], PAPER.start, atol=1e-12)
     late = t >= 3.0
     worst = np.abs(error[late]).max(axis=0)
     assert np.all(worst < 1e-3), f"largest error after 3 s [mrad]: {1e3 * worst}"

@@ -3,34 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.pose_identification import identify_static
-from dvrk_drake.dynamics.friction_compensation import Friction
+import dvrk_drake as dvrk
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.experiments.ground_truth import GroundTruth, collect, paper_arm, perturbed_ground_truth
-from dvrk_drake.experiments.reproduction.drift_experiment import DURATION, Approach, Drifts, Release, release_all
-from dvrk_drake.experiments.reproduction.published import (
-    FIGURE_7_FAULTY,
-    PAPER_ARM,
-    PaperRecordings,
-    paper_model,
-    with_zero_torque,
-)
-from dvrk_drake.experiments.transparency import Compensation, OperatorForces, random_path, simulate_operator
+from dvrk_drake.dynamics.model_links import model_bodies
+from dvrk_drake.experiments.ground_truth import MASS_RATIOS, collect, perturbed_arm, with_links
+from dvrk_drake.experiments.releases import DURATION, Drifts, release_all
+from dvrk_drake.experiments.reproduction.published import PAPER, PaperRecordings, paper_model
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.progress import Progress
+from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.recording import Recording
-from dvrk_drake.recordings.writing import write_recording
-from dvrk_drake.systems.gravity_pid_controller import Mode
 
 
 @dataclass(frozen=True)
@@ -40,43 +30,43 @@ class SampleSizes:
     Attributes:
         collected: Number of poses for the identification of an arm.
         releases: Number of random release poses for our model.
-        paper_releases: Number of release poses, counted from the first, that are also used for the paper's parameters.
-        hand_guided_releases: Number of release poses, counted from the first, that are also used for our model with an
-            approach.
-        psm_releases: Number of random release poses of the PSM.
+        few_releases: Number of release poses, counted from the first, that are used for all other cases.
         path_poses: Number of poses on the path of an operator.
         duration: Duration of a release [s].
     """
 
     collected: int = 40
     releases: int = 200
-    paper_releases: int = 20
-    hand_guided_releases: int = 20
-    psm_releases: int = 20
+    few_releases: int = 20
     path_poses: int = 5
     duration: float = DURATION
 
 
 @dataclass(frozen=True, eq=False)
 class IdentifiedArm:
-    """Ground-truth arm and its identified model.
+    """Simulated arm and its identified model.
 
     Attributes:
-        truth: Ground-truth arm.
-        poses: Static poses collected on the ground-truth arm.
+        arm: Simulated arm with the effects of a real arm.
+        origin: Text that states the source of its links and effects.
+        poses: Static poses collected on the simulated arm.
         model: Model identified from the poses.
-        file: Path of the model file.
     """
 
-    truth: GroundTruth
+    arm: Arm
+    origin: str
     poses: Recording
     model: IdentifiedModel
-    file: Path
+
+    @property
+    def exact(self) -> IdentifiedModel:
+        """Exact model of the gravity, cable and spring torques, used only for evaluation."""
+        return IdentifiedModel.from_arm(self.arm, self.arm.effects.position_dependent)
 
 
 @dataclass(eq=False)
 class ReproductionSession:
-    """Reproduction of the paper's experiments. `mtm`, `psm` and `paper_file` are created at their first use.
+    """Reproduction of the paper's experiments. `mtm`, `psm` and `paper_model` are created at their first use.
 
     Attributes:
         folder: Output folder.
@@ -84,7 +74,7 @@ class ReproductionSession:
         executor: Executor of the simulations.
         progress: Function called with the step and its finished share, 0..1.
         sample_sizes: Sample sizes of the experiments.
-        seed: Seed of ground-truth arms, poses and noise.
+        seed: Seed of perturbed arms, poses and noise.
     """
 
     folder: Path
@@ -96,130 +86,104 @@ class ReproductionSession:
 
     @cached_property
     def mtm(self) -> IdentifiedArm:
-        """Identified MTM: the paper's arm if its recording is available, else a perturbed ground-truth arm."""
-        self.progress("making the ground-truth MTM", 0.0)
+        """Identified MTM: the paper's arm if its recording is available, else a perturbed arm."""
         if self.recordings.folder is None:
-            truth = perturbed_ground_truth(PAPER_ARM, self.folder, self.seed)
-        else:
-            truth = paper_arm(self.recordings.poses, self.folder)
-        return self._identify(truth, PAPER_ARM)
+            return self._identify(*self._perturbed(PAPER.arm, PAPER.without))
+        origin = (
+            "The simulated arm is the paper's MTM. Its gravity, cables and springs are identified from the paper's 72 "
+            "poses. Its friction, stops, encoders, motors and delays are those of another MTM "
+            "(`mechanisms/mtm.yaml`)."
+        )
+        return self._identify(_paper_arm(self.recordings.poses, self.folder / f"true_{PAPER.arm}.sdf"), origin)
 
     @cached_property
     def psm(self) -> IdentifiedArm:
-        """Identified PSM, a perturbed ground-truth arm."""
-        return self._identify(perturbed_ground_truth("psm", self.folder, self.seed), "psm")
+        """Identified PSM, a perturbed arm."""
+        return self._identify(*self._perturbed(PAPER.second_arm))
 
     @cached_property
-    def paper_file(self) -> Path:
-        """Path of the model file with the paper's parameters.
+    def paper_model(self) -> IdentifiedModel:
+        """Model with the paper's parameters.
 
-        For a perturbed ground-truth arm, the paper's method identifies this model from the same poses as our model.
+        For a perturbed arm, the paper's method identifies this model from the same poses as our model.
         """
-        mtm, path = self.mtm, self.folder / "paper_model.yaml"
-        if mtm.truth.is_paper_arm:
-            paper_model(load_arm(PAPER_ARM)).save(path)
-        else:
-            identify_static(mtm.poses, load_arm(PAPER_ARM), "paper").model.save(path)
-        return path
+        arm = dvrk.load_arm(PAPER.arm)
+        if self.recordings.folder is not None:
+            return paper_model(arm)
+        return dvrk.identify(self.mtm.poses, arm, method="paper").model
 
     def release(
         self,
-        name: str,
-        truth: GroundTruth,
-        model: Path,
-        poses: NDArray[np.float64],
+        what: IdentifiedArm,
+        model: IdentifiedModel,
+        count: int,
         label: str,
-        parts: Sequence[str] = ("all",),
-        mode: Mode = "gravity",
-        approach: Approach = "none",
-        hysteresis_ratio: float = 0.0,
-        max_duration: float = DURATION,
+        duration: float = DURATION,
+        **more: Any,
     ) -> Drifts:
-        """Simulates releases of an arm at several poses.
+        """Simulates releases of an arm at random poses inside its limits. Pose i does not depend on the count.
 
         Args:
-            name: Name of the arm.
-            truth: Ground-truth arm to simulate.
-            model: Path of the controller's model file.
-            poses: Release poses (m, n) [rad, m].
+            what: Arm to simulate.
+            model: Model of the controller.
+            count: Number of poses.
             label: Name of the step for `progress`.
-            parts, mode, approach, hysteresis_ratio: See `Release`.
-            max_duration: Maximum duration of each release [s]. `sample_sizes` can reduce it.
+            duration: Largest duration of a release [s]. `sample_sizes` can reduce it.
+            more: Other arguments of `release`.
         """
-        duration = min(self.sample_sizes.duration, max_duration)
-        template = Release(
-            name,
-            truth.arm,
-            tuple(parts),
-            str(model),
-            poses[0],
-            mode,
-            approach,
-            hysteresis_ratio,
-            duration,
-            self.seed,
-        )
-        cases = [dataclasses.replace(template, start=pose, seed=self.seed + i) for i, pose in enumerate(poses)]
-        positions = release_all(cases, self.executor, lambda share: self.progress(label, share))
-        return Drifts(truth.arm, positions)
+        duration, report = min(self.sample_sizes.duration, duration), step_progress(self.progress, label)
+        poses = self.random_poses(what.arm, count)
+        return release_all(what.arm, model, poses, self.executor, report, duration=duration, seed=self.seed, **more)
 
-    def random_poses(self, name: str, count: int) -> NDArray[np.float64]:
+    @staticmethod
+    def nominal(arm: Arm) -> Arm:
+        """Returns the arm with the links and effects of its files."""
+        return dvrk.load_arm(arm.source)
+
+    def random_poses(self, arm: Arm, count: int) -> NDArray[np.float64]:
         """Returns random poses (count, n) inside the limits. Pose i depends on the seed and i, but not on the count."""
-        poses = [load_arm(name).sample_poses(1, np.random.default_rng([self.seed, i]))[0] for i in range(count)]
-        return np.array(poses)
+        return np.array([arm.sample_poses(1, np.random.default_rng([self.seed, i]))[0] for i in range(count)])
 
-    def without_wrist_torque(self, model: Path) -> Path:
-        """Writes a model file with zero torque on joints 5 to 7; returns its path."""
-        path = model.with_stem(model.stem + "_zeroed")
-        with_zero_torque(IdentifiedModel.load(model), FIGURE_7_FAULTY).save(path)
-        return path
-
-    def _identify(self, truth: GroundTruth, name: str) -> IdentifiedArm:
-        arm_name = name.upper()
-        poses = collect(
-            truth,
-            name,
-            self.sample_sizes.collected,
-            self.seed,
-            self.executor,
-            lambda share: self.progress(f"collecting poses of the {arm_name}", share),
+    def _perturbed(self, name: str, without: tuple[str, ...] = ()) -> tuple[Arm, str]:
+        origin = (
+            "The simulated arm has the links of the SDF with random changes of their masses by up to "
+            f"{100 * (MASS_RATIOS[1] - 1):.0f} % (seed {self.seed}). Its effects are those of `mechanisms/`: friction, "
+            "cables, encoders, motors and delays."
         )
-        recording, file = self.folder / f"{name}_poses.csv", self.folder / f"{name}_model.yaml"
-        write_recording(poses, recording, load_arm(name))
-        identification = identify_static(
-            poses, load_arm(name), progress=lambda share: self.progress(f"identifying the {arm_name}", share)
-        )
-        identification.model.provenance.recording = recording.name
-        identification.model.save(file)
-        return IdentifiedArm(truth, poses, identification.model, file)
+        return perturbed_arm(dvrk.load_arm(name), self.folder / f"true_{name}.sdf", self.seed, without=without), origin
+
+    def _identify(self, arm: Arm, origin: str) -> IdentifiedArm:
+        nominal, name = dvrk.load_arm(arm.source), arm.source
+        report = step_progress(self.progress, f"collecting poses of the {arm.name}")
+        poses = collect(arm, self.sample_sizes.collected, self.seed, self.executor, report)
+        dvrk.write_recording(poses, self.folder / f"{name}_poses.csv", nominal)
+        model = dvrk.identify(poses, nominal, progress=self.progress).model
+        model.provenance.recording = f"{name}_poses.csv"
+        model.save(self.folder / f"{name}_model.yaml")
+        return IdentifiedArm(arm, origin, poses, model)
 
 
-@dataclass(frozen=True, eq=False)
-class OperatorCase:
-    """Picklable arguments of `simulate_case`.
+def _paper_arm(recording: Recording, path: Path) -> Arm:
+    """Identifies the paper's MTM from its recording and writes its SDF to `path`.
 
-    Attributes:
-        name: Name of the compensation.
-        arm: Arm to simulate.
-        model: Path of the controller's model file, or "" for unpowered motors.
-        friction_ratio: Compensated share of the friction.
-        poses: Number of random poses that define the path.
-        seed: Seed of the path and of the effects' noise.
+    The links are physically consistent and have the identified gravity torque. They are as close as possible to the
+    links of the SDF of this package. Cables and springs are those of the identified model. Friction, stops, encoders,
+    motors and delays are those of `mechanisms/mtm.yaml`, because static poses do not determine them. Friction that is
+    larger in one direction causes a constant torque in static poses, which is identified as an offset. The simulated
+    friction already contains this torque. Therefore the identified offset of a joint with such friction is omitted.
+
+    Raises:
+        RecordingError, IdentificationError, ModelError: The recording is not of an MTM at rest.
     """
-
-    name: str
-    arm: Arm
-    model: str
-    friction_ratio: float
-    poses: int
-    seed: int
-
-
-def simulate_case(case: OperatorCase) -> OperatorForces:
-    """Simulates an operator who moves an arm along a path through random poses."""
-    model = IdentifiedModel.load(case.model) if case.model else None
-    # The controller uses the friction of the arm files, but an identified gravity model.
-    friction = Friction.of_arm(load_arm(PAPER_ARM))
-    compensation = Compensation(case.name, model, case.friction_ratio, friction)
-    path = random_path(case.arm, case.poses, seed=case.seed)
-    return simulate_operator(case.arm, path, compensation, effects=case.arm.effects, seed=case.seed)
+    arm = dvrk.load_arm(PAPER.arm)
+    model = dvrk.identify(recording, arm).model
+    one_sided = {law.coordinate for law in arm.effects.friction if law.kind == "presliding forward"}
+    laws = [
+        law
+        for law in model.effects
+        if law.kind != "offset" or law.coordinate.replace("joint.", "actuator.", 1) not in one_sided
+    ]
+    joints = [dataclasses.replace(joint, feedforward_scale=1.0) for joint in model.joints]
+    links = model_bodies(dataclasses.replace(model, joints=joints, effects=laws)).links
+    effects = dataclasses.replace(arm.effects, cables=laws, springs=[])
+    return dataclasses.replace(with_links(arm, links, path, "the paper's recording"), effects=effects)

@@ -2,36 +2,29 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
+from pydrake.systems.primitives import ConstantVectorSource
 
+import dvrk_drake as dvrk
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia, link_inertias
 from dvrk_drake.experiments.ground_truth import with_links
-from dvrk_drake.experiments.reproduction import published
-from dvrk_drake.experiments.reproduction.published import PAPER_ARM
-from dvrk_drake.experiments.simulation import samples
+from dvrk_drake.experiments.reproduction.published import PAPER
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.arm_files import load_arm
+from dvrk_drake.models.effects_schema import EFFECT_NAMES
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions, tree_selector
-from dvrk_drake.systems.arm_station import ArmStation
-from dvrk_drake.systems.closed_loop import add_closed_loop
-from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
 #: Duration of the simulations with the paper's controller and with our controller [s].
 DURATION, OUR_DURATION = 60.0, 10.0
 #: Period of the paper's controller and sample period of all results [s].
 PERIOD = 0.01
-#: Inertia of each link about each axis in the paper's model [kg m^2], from the PSM file of the paper's team and the
-#: period of J2 in Fig. 7.
-LINK_INERTIA = 1.0
 #: Mass [kg] and inertia [kg m^2] of linkage bars and rotors, which the paper's model does not have.
 _NEGLIGIBLE = 1e-6
 
@@ -44,7 +37,7 @@ def paper_simulated_arm(arm: Arm, path: Path) -> Arm:
     for link in link_inertias(arm):
         mass, inertia = _NEGLIGIBLE, _NEGLIGIBLE
         if link.link in driven_links:
-            mass, inertia = published.FIGURE_7_MASSES[1 + driven_links.index(link.link)], LINK_INERTIA
+            mass, inertia = PAPER.masses[driven_links.index(link.link)], PAPER.link_inertia
         links.append(LinkInertia(link.link, np.array([mass, 0, 0, 0, inertia, inertia, inertia, 0, 0, 0])))
     return with_links(arm, links, path, "the paper's simulated MTM: point masses at the joints")
 
@@ -70,24 +63,21 @@ def simulate_paper_controller(
     plant = make_arm_plant(arm)
     simulator = Simulator(plant)
     context = simulator.get_mutable_context()
-    tree = tree_selector(plant, arm)
-    own = tree[[arm.tree_joint_names.index(name) for name in arm.joint_names]]
-    kp, kv, ki = map(np.array, (published.FIGURE_7_KP, published.FIGURE_7_KV, published.FIGURE_7_KI))
+    own = tree_selector(plant, arm)[[arm.tree_joint_names.index(name) for name in arm.joint_names]]
+    kp, kv, ki = map(np.array, (PAPER.kp, PAPER.kv, PAPER.ki))
     integral, force = np.zeros(arm.num_joints), np.zeros(plant.num_velocities())
-    port = plant.get_applied_generalized_force_input_port()
-    start = np.array(published.FIGURE_7_START)
-    start[5:] = published.FIGURE_7_VALUES["J6"], published.FIGURE_7_VALUES["J7 early"]
-    set_arm_positions(plant, context, arm, start)
+    start = [*PAPER.start[:5], PAPER.amplitude_6, PAPER.early_7]
+    set_arm_positions(plant, context, arm, np.array(start))
     samples = round(duration / PERIOD) + 1
     q = np.empty((samples, arm.num_joints))
     for k in range(samples):
         q[k] = plant.GetPositions(context)[own]
         v = plant.GetVelocities(context)[own]
         if faulty:
-            v[list(published.FIGURE_7_FAULTY)] = q[k, list(published.FIGURE_7_FAULTY)]
+            v[PAPER.wrist] = q[k, PAPER.wrist]
         integral -= q[k]
-        force[own] = _gravity(plant, simulator, arm) - kp * q[k] - kv * v + ki * integral
-        port.FixValue(context, force)
+        force[own] = holding_torque(plant, context, arm) - kp * q[k] - kv * v + ki * integral
+        plant.get_applied_generalized_force_input_port().FixValue(context, force)
         if k + 1 < samples:
             simulator.AdvanceTo((k + 1) * PERIOD)
         if k % 100 == 0:
@@ -95,23 +85,30 @@ def simulate_paper_controller(
     return q
 
 
-def simulate_ours(ground_truth_arm: Arm, model: IdentifiedModel, duration: float) -> NDArray[np.float64]:
-    """Simulates our controller with all effects except stops; returns q (samples, n) [rad], one row per `PERIOD`."""
-    arm = load_arm(PAPER_ARM)
-    station = ArmStation(arm, plant_arm=ground_truth_arm, effects=ground_truth_arm.effects.without("stops"))
+def simulate_ours(arm: Arm, model: IdentifiedModel, duration: float) -> NDArray[np.float64]:
+    """Simulates our controller with all effects except stops; returns q (samples, n) [rad], one row per `PERIOD`.
+
+    The start pose is beyond the coupled limits of the arm, which its stops enforce. The desired position is zero from
+    the start on, so the error is a step.
+    """
     builder = DiagramBuilder()
-    controller = GravityPidController(model)
-    add_closed_loop(builder, station, controller, ConstantVectorSource(np.zeros(2 * arm.num_joints)))
-    log = LogVectorOutput(station.GetOutputPort(f"{PAPER_ARM}.state_true"), builder, PERIOD)
-    simulator = Simulator(builder.Build())
-    context = simulator.get_mutable_context()
-    station.SetPositions(station.GetMyMutableContextFromRoot(context), published.FIGURE_7_START)
-    simulator.AdvanceTo(duration)
-    return samples(log, simulator)[:, : arm.num_joints]
-
-
-def _gravity(plant: MultibodyPlant, simulator: Simulator, arm: Arm) -> NDArray[np.float64]:
-    return holding_torque(plant, simulator.get_context(), arm)
+    controller = builder.AddSystem(dvrk.GravityPidController(model))
+    zero = builder.AddSystem(ConstantVectorSource(np.zeros(2 * arm.num_joints)))
+    builder.Connect(zero.get_output_port(), controller.GetInputPort("desired_state"))
+    builder.ExportInput(controller.GetInputPort("state_estimated"), "state_estimated")
+    builder.ExportOutput(controller.GetOutputPort("effort"), "effort")
+    unlimited = dataclasses.replace(arm, coupled_limits=())
+    effects = [name for name in EFFECT_NAMES if name != "stops"]
+    run = dvrk.simulate(
+        unlimited,
+        controller=builder.Build(),
+        effects=effects,
+        start=PAPER.start,
+        duration=duration,
+        sample_period=PERIOD,
+        closure="mimic",
+    )
+    return run.state_true[:, : arm.num_joints]
 
 
 def oscillation_modes(arm: Arm, faulty: bool) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
@@ -129,11 +126,10 @@ def oscillation_modes(arm: Arm, faulty: bool) -> tuple[NDArray[np.complex128], N
     set_arm_positions(plant, context, arm, np.zeros(arm.num_joints))
     tree, G = tree_selector(plant, arm), arm.linkage.matrix
     M = G.T @ plant.CalcMassMatrix(context)[np.ix_(tree, tree)] @ G
-    K, D = np.diag(published.FIGURE_7_KP), np.diag(published.FIGURE_7_KV)
+    K, D = np.diag(PAPER.kp), np.diag(PAPER.kv)
     if faulty:
-        wrist = list(published.FIGURE_7_FAULTY)
-        K[wrist] += D[wrist]
-        D[wrist] = 0.0
+        K[PAPER.wrist] += D[PAPER.wrist]
+        D[PAPER.wrist] = 0.0
     zero, one = np.zeros_like(M), np.eye(len(M))
     values, vectors = np.linalg.eig(np.block([[zero, one], [-np.linalg.solve(M, K), -np.linalg.solve(M, D)]]))
     use = values.imag > 1e-6

@@ -154,7 +154,7 @@ class _Run(NamedTuple):
         error: Differences (m, k) between the true and the desired positions [rad, m].
         effort_share: Absolute measured efforts (m, k), divided by the effort limits.
         departure: Start time of the motion to the last target [s].
-        arrival: Time of the last target or of the release by the hand, whichever is later [s].
+        arrival: Time of the last target, of the release, or of the release by the hand, whichever is later [s].
         displacement: Displacement (k,) of the motion to the last target [rad, m].
         goal: Final desired positions (k,) [rad, m].
     """
@@ -174,8 +174,9 @@ class _Run(NamedTuple):
 
 
 def _arrival(scenario: Scenario) -> float:
-    """Returns the time of the last target or of the release by the hand, whichever is later [s]."""
-    return max(float(scenario.knots()[0][-1]), *(point.time for point in scenario.hand.path), 0.0)
+    """Returns the time of the last target, of the release, or of the release by the hand, whichever is later [s]."""
+    hand = (point.time for point in scenario.hand.path)
+    return max(float(scenario.knots()[0][-1]), *hand, scenario.controller.release_time)
 
 
 def _settling_time(run: _Run, band: NDArray[np.float64], time: float) -> float:
@@ -241,8 +242,8 @@ class Kind(NamedTuple):
 
 #: Kinds of measures. They are computed from the true positions and the measured efforts of the evaluated joints at the
 #: recorded times. In mode "hold" the desired pose is that of the controller. In other modes it is the pose at the start
-#: or, with a hand, at the release. Samples before the release are excluded. The bands of prismatic joints are 0.1 m
-#: times those of revolute joints, since 0.1 m is a typical distance of a tip from the axes that move it.
+#: or, with a release time or a hand, at the release. Samples before the release are excluded. The bands of prismatic
+#: joints are 0.1 m times those of revolute joints, since 0.1 m is a typical distance of a tip from the axes that move it.
 #:
 #: settling_time: Time from the last target until all joints stay within `band` of the final desired pose; infinite if
 #: they do not settle.

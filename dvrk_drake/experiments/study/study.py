@@ -17,7 +17,7 @@ from dvrk_drake.experiments.scenario import Scenario
 from dvrk_drake.experiments.simulation import simulate
 from dvrk_drake.experiments.study.measures import Measure
 from dvrk_drake.experiments.study.study_file import Case, Study, versions
-from dvrk_drake.experiments.study.table import ParquetStudyTable, Row, StudyTable
+from dvrk_drake.experiments.study.table import Row, StudyTable
 from dvrk_drake.workers import local_executor
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ def run_study(
         study: Study to run.
         executor: Executor of threads or processes, or a Dask client's `get_executor(pure=False)`. Its workers need
             this package and the files of the scenario.
-        output: Path of a CSV or Parquet file, see `StudyTable`. Existing rows of the same study are kept.
+        output: Path of a CSV file, see `StudyTable`. Existing rows of the same study are kept.
         progress: Function called at the start and after each run.
 
     Returns:
@@ -49,10 +49,9 @@ def run_study(
         ScenarioError, ArmError, ModelError: The scenario or one of its variations is invalid.
     """
     study.check()
-    table_type = ParquetStudyTable if Path(output).suffix.lower() == ".parquet" else StudyTable
     futures: dict[Future[Row], Case] = {}
     losses: list[tuple[Case, BaseException]] = []
-    with table_type(output, study) as table:
+    with StudyTable(output, study) as table:
         missing = [case for case in study.cases if case.index not in table.rows]
         progress(len(table.rows), len(study.cases))
         try:

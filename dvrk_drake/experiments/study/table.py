@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import dataclasses
 import fcntl
 import io
 from collections.abc import Mapping
@@ -162,70 +161,6 @@ def _lock(path: Path) -> IO[bytes]:
             f"{path}: another process is writing this file. Wait for it, or give another output."
         ) from error
     return file
-
-
-try:
-    import pyarrow
-    import pyarrow.parquet
-except ImportError:
-    pyarrow = None
-
-
-class ParquetStudyTable(StudyTable):
-    """Variant of `StudyTable` for a Parquet file with the same columns.
-
-    A Parquet file cannot be read before it is complete. Therefore the rows are first written to a CSV file with the
-    name of the Parquet file and the suffix `.rows.csv`. When all rows are available, they are converted to the Parquet
-    file, and the CSV file is removed.
-    """
-
-    def __init__(self, path: str | Path, study: Study) -> None:
-        """Opens the table at `path`. The file is new or contains rows of the same study.
-
-        Raises:
-            StudyError: The table cannot be opened (see `StudyTable`), or pyarrow is not installed.
-            RecordingError: The file cannot be read or written.
-        """
-        if pyarrow is None:
-            raise StudyError(
-                f"{path}: Parquet requires pyarrow. Run: pip install 'dvrk-drake[parquet]'. Or give a .csv file."
-            )
-        self._parquet = Path(path)
-        finished = _finished_rows(self._parquet, study) if self._parquet.exists() else {}
-        super().__init__(f"{path}.rows.csv", study)
-        self.rows.update(finished)
-
-    def sort(self) -> None:
-        """Writes the Parquet file atomically, in the order of the cases, and removes the CSV file."""
-        content = []
-        for case in self._study.cases:
-            key = {"study": self._study.fingerprint, **dataclasses.asdict(case), "case": case.index}
-            starts = {name: q for name, q in zip(self._starts, case.start, strict=True)}
-            row = self.rows[case.index]
-            content.append({**key, **starts, **row.values, "error": row.error or None})
-        with atomic_write(self._parquet, "wb") as stream:
-            pyarrow.parquet.write_table(pyarrow.Table.from_pylist(content, self._schema()), stream)
-        self._path.unlink()
-
-    def _schema(self) -> pyarrow.Schema:
-        text, whole, number = pyarrow.string(), pyarrow.int64(), pyarrow.float64()
-        types = {"study": text, "case": whole, "variation": text, "pose": whole, "seed": whole, "error": text}
-        types |= {measure.column: pyarrow.bool_() if measure.is_boolean else number for measure in self._study.measures}
-        return pyarrow.schema([(name, types.get(name, number)) for name in self._header])
-
-
-def _finished_rows(path: Path, study: Study) -> dict[int, Row]:
-    """Reads the rows of a finished study, by the number of the case."""
-    try:
-        content = pyarrow.parquet.read_table(path).to_pylist()
-    except (OSError, pyarrow.ArrowException) as error:
-        raise StudyError(
-            f"{path}: the file exists and does not contain results of a study. Give another output."
-        ) from error
-    if {row.get("study") for row in content} != {study.fingerprint}:
-        raise StudyError(f"{path}: the results are from a different study. Give another output.")
-    names = [measure.column for measure in study.measures]
-    return {row["case"]: Row({} if row["error"] else {n: row[n] for n in names}, row["error"] or "") for row in content}
 
 
 @dataclass(frozen=True)

@@ -1,126 +1,127 @@
-"""Writes the results to an HTML page with figures and tables, and each table to a CSV file."""
+"""Reproduces the requested figures and tables, and writes them to an HTML page, PNG and CSV files."""
 
 from __future__ import annotations
 
 import csv
-import io
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import ArrayLike
-
-from dvrk_drake.experiments.study.table import Share
+from dvrk_drake.errors import DvrkDrakeError
+from dvrk_drake.experiments.reproduction.published import PaperRecordings
+from dvrk_drake.experiments.reproduction.session import ReproductionSession, SampleSizes
 from dvrk_drake.models.files import atomic_write
-from dvrk_drake.reports import page as blocks
+from dvrk_drake.progress import Progress
 from dvrk_drake.reports.html_file import write_html
 from dvrk_drake.reports.image_files import write_images
-from dvrk_drake.reports.page import Page, Plot, Table, Text
+from dvrk_drake.reports.page import Page, Section, Table, Text
 from dvrk_drake.reports.provenance import Provenance
+from dvrk_drake.reports.reproduction.drift import reproduce_figure_5, reproduce_figure_6, reproduce_psm
+from dvrk_drake.reports.reproduction.figures import (
+    reproduce_figure_4,
+    reproduce_figure_7,
+    reproduce_table_1,
+    reproduce_transparency,
+)
+from dvrk_drake.workers import local_executor
+
+_MAKERS: dict[str, Callable[[ReproductionSession], Section]] = {
+    "table1": reproduce_table_1,
+    "fig4": reproduce_figure_4,
+    "fig5": reproduce_figure_5,
+    "fig6": reproduce_figure_6,
+    "fig7": reproduce_figure_7,
+    "psm": reproduce_psm,
+    "transparency": reproduce_transparency,
+}
+#: Names of all sections, in the order of the page.
+NAMES = tuple(_MAKERS)
 
 
-@dataclass(frozen=True)
-class ResultTable:
-    """Table of results.
+def reproduce(
+    names: Sequence[str],
+    folder: Path,
+    recordings: PaperRecordings,
+    progress: Progress = lambda step, share: None,
+    sample_sizes: SampleSizes | None = None,
+    seed: int = 0,
+    command: Sequence[str] = (),
+) -> Page:
+    """Writes figures, tables and index.html. The function writes index.html again after each finished section.
 
-    Attributes:
-        name: Name of the CSV file without suffix, unique on a page.
-        title: Caption.
-        header: Column headings.
-        rows: Cells of each row.
+    Args:
+        names: Sections to reproduce, from `NAMES`.
+        folder: Existing folder for the results.
+        recordings: Recordings of the paper. Without them, Fig. 4 is omitted if other sections are requested, and
+            Fig. 5 and 6 use a different arm.
+        progress: Function called with a step, for example "fig5: releasing", and the finished share of this step (0
+            to 1).
+        sample_sizes: Numbers of poses and releases. None: the default numbers.
+        seed: Seed of simulated arms, poses and noise.
+        command: Words of the command line, for the provenance.
+
+    Returns:
+        Page that was written, without the sections that could not be computed.
+
+    Raises:
+        DvrkDrakeError: A name is not in `NAMES`.
+        RecordingError: A recording cannot be read, or only Fig. 4 is requested and its recording is missing.
     """
-
-    name: str
-    title: str
-    header: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-
-    @property
-    def block(self) -> Table:
-        """The table for the page."""
-        return Table(self.header, self.rows, self.title, note=f"File: {self.name}.csv")
-
-    def csv(self) -> str:
-        """Returns the content of the CSV file."""
-        stream = io.StringIO()
-        csv.writer(stream, lineterminator="\n").writerows([self.header, *self.rows])
-        return stream.getvalue()
-
-
-@dataclass(frozen=True)
-class Section:
-    """Section of the results page for one figure, table or experiment.
-
-    Attributes:
-        name: Name of the section on the command line.
-        title: Heading.
-        finding: Result in one sentence.
-        remarks: Paragraphs about the experiment and the differences from the paper.
-        tables: Tables of results.
-        plots: Plots.
-    """
-
-    name: str
-    title: str
-    finding: str
-    remarks: tuple[str, ...]
-    tables: tuple[ResultTable, ...] = ()
-    plots: tuple[Plot, ...] = ()
-
-    @property
-    def blocks(self) -> blocks.Section:
-        """The section of the page."""
-        tables = (table.block for table in self.tables)
-        return blocks.Section(self.title, [Text(self.finding), *tables, *self.plots, *map(Text, self.remarks)])
+    if unknown := sorted(set(names) - set(NAMES)):
+        raise DvrkDrakeError(f"{', '.join(unknown)} cannot be reproduced; allowed: {', '.join(NAMES)}")
+    wanted = [name for name in NAMES if name in names]
+    left_out = []
+    if recordings.folder is None and "fig4" in wanted and len(wanted) > 1:
+        wanted.remove("fig4")
+        left_out.append("Fig. 4 requires the recording of the paper. Give its folder with --data.")
+    sections: list[Section] = []
+    with local_executor() as executor:
+        session = ReproductionSession(
+            folder, recordings, executor, sample_sizes=sample_sizes or SampleSizes(), seed=seed
+        )
+        for name in wanted:
+            progress(name, 0.0)
+            session.progress = _within(progress, name)
+            sections.append(_MAKERS[name](session))
+            unfinished = [f"{later} was not finished." for later in wanted[len(sections) :]]
+            page = write_page(folder, sections, [*left_out, *unfinished], Provenance.of(recordings.files, command))
+    return page
 
 
-def write_page(folder: Path, sections: Sequence[Section], left_out: Sequence[str], origin: Provenance) -> Path:
-    """Writes index.html, a CSV file for each table and a PNG file for each plot.
+def _within(progress: Progress, name: str) -> Progress:
+    return lambda step, share: progress(f"{name}: {step}", share)
+
+
+def write_page(folder: Path, sections: Sequence[Section], left_out: Sequence[str], origin: Provenance) -> Page:
+    """Writes index.html, a CSV file for each table with a name, and a PNG file for each plot.
 
     Args:
         folder: Existing folder.
-        sections: Sections of the page, in order.
+        sections: Sections of the page, in order. Each begins with the finding.
         left_out: Requested results that could not be computed, with the reason for each.
         origin: Provenance of the page.
-
-    Returns:
-        Path of index.html.
     """
-    for section in sections:
-        for table in section.tables:
-            with atomic_write(folder / f"{table.name}.csv") as stream:
-                stream.write(table.csv())
+    findings = [(section.title, section.finding) for section in sections]
     missing = [Text(f"Missing: {reason}", "warning") for reason in left_out]
-    findings = Table(("result", "finding"), [(section.title, section.finding) for section in sections])
     page = Page(
         "Reproduction of the paper",
         f"{len(sections)} of {len(sections) + len(left_out)} requested results were computed.",
-        [blocks.Section("Findings", [*missing, findings], _PREFACE), *(section.blocks for section in sections)],
+        [Section("Findings", [*missing, Table(("result", "finding"), findings)], _PREFACE), *sections],
         "warning" if left_out else "good",
         *(_NEXT_DATA if left_out else _NEXT_STUDY),
     )
+    for table in page.blocks:
+        if isinstance(table, Table) and table.name:
+            with atomic_write(folder / f"{table.name}.csv") as stream:
+                csv.writer(stream, lineterminator="\n").writerows([table.header, *table.rows])
     write_images(page, folder)
     write_html(page, folder / "index.html", origin)
-    return folder / "index.html"
-
-
-def numbers(values: ArrayLike, pattern: str) -> tuple[str, ...]:
-    """Returns each number as text, formatted with a pattern such as "{:.3f}"."""
-    return tuple(pattern.format(x) for x in np.asarray(values).tolist())
-
-
-def share(held: int, total: int) -> str:
-    """Returns the share held / total, with its 95 % confidence interval (Wilson, 1927), as text."""
-    interval = Share.of(held, total)
-    low, high = 100 * interval.lower, 100 * interval.upper
-    return f"{held} of {total} ({100 * held / total:.1f} %, 95 % interval {low:.1f}..{high:.1f} %)"
+    return page
 
 
 _PREFACE = (
     "This page compares published figures and tables of Gravity Compensation Control of da Vinci Robot (Rutfield, "
-    "Zia, Boos, Santoso, Sujumnong, WPI 2015) with results of `dvrk-drake reproduce`. Angles are in rad, torques in "
-    "N m. "
+    "Zia, Boos, Santoso, Sujumnong, WPI 2015) with results of `dvrk-drake reproduce`. Each table is also a CSV file. "
+    "Angles are in rad, torques in N m. "
     '"The paper\'s" denotes the method or parameters of the paper, "ours" denotes the method or model of this project.'
 )
 _NEXT_DATA = (

@@ -236,26 +236,6 @@ def test_interrupted_study_keeps_rows_and_cancels_rest(reference, tmp_path):
     assert path.read_bytes() == reference
 
 
-def test_parquet_matches_csv(reference, tmp_path):
-    parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra parquet")
-    path = tmp_path / "results.parquet"
-    with WorkerLossExecutor(9) as executor, pytest.raises(StudyError):
-        run_study(make_study(), executor, path)
-    assert not path.exists()
-    assert len((tmp_path / "results.parquet.rows.csv").read_bytes().splitlines()) == 10
-    for num_cases in (15, 0):  # first the missing cases, then none
-        with WorkerLossExecutor(num_cases) as executor:
-            run_study(make_study(), executor, path)
-        assert {p.name for p in tmp_path.iterdir()} == {"reference.csv", "results.parquet"}
-    table = parquet.read_table(path)
-    assert table.schema.field("held").type == "bool"
-    for ours, theirs in zip(table.to_pylist(), csv.DictReader(reference.decode().splitlines()), strict=True):
-        texts = {name: "" if value is None else str(value) for name, value in ours.items()}
-        assert texts | {"held": texts["held"].lower()} == theirs
-    with WorkerLossExecutor(0) as executor, pytest.raises(StudyError, match="the results are from a different study"):
-        run_study(make_study(seeds=[5]), executor, path)
-
-
 def test_wilson_interval_counts_failed_runs_as_worst(tmp_path):
     study = make_study(random_poses=RandomPoses(60, seed=1))
     with ThreadPoolExecutor(1) as executor:

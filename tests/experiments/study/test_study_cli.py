@@ -95,7 +95,7 @@ def test_rejects_invalid_files_and_outputs(study, tmp_path, capsys):
     for output, message in (
         (tmp_path / "none" / "r.csv", "cannot be written"),
         (tmp_path / "folder.csv", "is not a regular file"),
-        (tmp_path / "r.txt", "must end in .csv or .parquet"),
+        (tmp_path / "r.txt", "must end in .csv"),
     ):
         assert main(["simulate", "study", str(study), "--output", str(output)]) == 2
         assert message in refusal(capsys.readouterr().err)
