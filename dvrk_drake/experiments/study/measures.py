@@ -243,7 +243,8 @@ class Kind(NamedTuple):
 #: Kinds of measures. They are computed from the true positions and the measured efforts of the evaluated joints at the
 #: recorded times. In mode "hold" the desired pose is that of the controller. In other modes it is the pose at the start
 #: or, with a release time or a hand, at the release. Samples before the release are excluded. The bands of prismatic
-#: joints are 0.1 m times those of revolute joints, since 0.1 m is a typical distance of a tip from the axes that move it.
+#: joints are 0.1 m times those of revolute joints, since 0.1 m is a typical distance of a tip from the axes that move
+#: it.
 #:
 #: settling_time: Time from the last target until all joints stay within `band` of the final desired pose; infinite if
 #: they do not settle.
