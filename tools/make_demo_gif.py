@@ -16,14 +16,8 @@ from playwright.sync_api import sync_playwright
 from dvrk_drake.experiments.demo.demo import RELEASE_TIME
 
 FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-gpu")
-#: Hides the control panel of Meshcat.
-HIDE_PANEL = ".dg, #status-message, #stats-plot { display: none !important; }"
-#: Hides the captions in the scene, which are too small for a GIF. `label` writes larger ones.
-HIDE_CAPTIONS = """() => {
-  const overlay = (node) => node.children["overlay"] || Object.values(node.children).map(overlay).find(Boolean);
-  const captions = overlay(viewer.scene_tree).children;
-  for (const name of ["phase", "colours"]) captions[name].object.visible = false;
-}"""
+#: Hides the control panel of Meshcat, and the captions, which are too small for a GIF. `label` writes larger ones.
+HIDE_PANEL = ".dg, #captions, #status-message, #stats-plot { display: none !important; }"
 #: Texts on the pictures, with their colours: the arm, and the ghost while it is visible.
 ARM, GHOST = ("grey: identified model", "#1f1f1f"), ("green: model that was not identified", "#1b6b40")
 TEXT_SIZE = 20
@@ -47,7 +41,6 @@ def frames(page_file: Path, times: np.ndarray, size: tuple[int, int], chromium: 
         page.add_style_tag(content=HIDE_PANEL)
         page.wait_for_function("viewer.animator.duration > 0")
         page.wait_for_timeout(3000)  # meshes are loaded in the background
-        page.evaluate(HIDE_CAPTIONS)
         for time in times:
             page.evaluate(SHOW, float(time))
             pictures.append(label(Image.open(io.BytesIO(page.screenshot())).convert("RGB"), time))
