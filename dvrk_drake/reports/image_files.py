@@ -106,7 +106,9 @@ def _draw(ax: Axes, panel: Panel, loc: Any, width: int) -> None:
         ax.grid(visible=False, axis="y")
     if panel.title:
         ax.set_title(textwrap.fill(panel.title, width), loc=loc)
-    ax.set(xlabel=panel.x_label, ylabel=panel.y_label, xlim=panel.x_range, ylim=panel.y_range or ax.get_ylim())
+    ax.set(xlabel=panel.x_label, ylabel=panel.y_label, xlim=panel.x_range)
+    if panel.y_range is not None:
+        ax.set_ylim(panel.y_range)
     if panel.log_x:
         ax.set_xscale("log")
     if panel.log_y:

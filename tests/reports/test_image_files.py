@@ -27,6 +27,15 @@ def test_unused_panels_are_removed(count):
     plt.close(figure)
 
 
+def test_logarithmic_axis_has_the_range_of_the_values():
+    y = np.array([1e-6, 1e-4, 1e-2])
+    panel = Panel("J1", [Curve("curve", [0, 1, 2], y, FITTED)], "t [s]", "error [1]", log_y=True)
+    figure = draw_plot(Plot("name", "caption", [panel]), "title")
+    low, high = figure.axes[0].get_ylim()
+    assert 1e-7 < low <= y.min() and y.max() <= high < 1e-1
+    plt.close(figure)
+
+
 def test_rules_find_faults():
     figure, panels = plt.subplots(1, 2)
     panels[0].plot([0, 1], [0, 1], label="curve")
