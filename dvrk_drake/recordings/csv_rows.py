@@ -24,8 +24,10 @@ from dvrk_drake.models.files import open_input
 
 #: Size of the blocks in which a file is read [bytes], and maximum number of characters of a line.
 _BLOCK, _MAX_LINE = 1 << 20, 1 << 20
+#: Number of bytes at the beginning of a text that must not contain a null byte.
+_HEAD = 4096
 #: Beginning of a file that is compressed with gzip.
-GZIP_MAGIC = b"\x1f\x8b"
+_GZIP_MAGIC = b"\x1f\x8b"
 #: Maximum size of a file whose rows are kept as text [bytes].
 _MAX_ROWS = 64_000_000
 #: Maximum number of rows of numbers, i.e. 15 min at 1 kHz. With this number of rows, `check` needs 1.5 GB of memory.
@@ -76,10 +78,17 @@ class CsvFile(NamedTuple):
             size = max(1, file.seek(0, io.SEEK_END))
             file.seek(0)
             try:
-                is_compressed = file.read(len(GZIP_MAGIC)) == GZIP_MAGIC
+                is_compressed = file.read(len(_GZIP_MAGIC)) == _GZIP_MAGIC
                 file.seek(0)
                 content = io.BufferedReader(gzip.GzipFile(fileobj=file) if is_compressed else file, _BLOCK)
-                encoding = "utf-16" if is_utf16(content.peek(2)) else "utf-8-sig"
+                start = content.peek(_HEAD)[:_HEAD]
+                is_utf16 = start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+                if b"\0" in start and not is_utf16:
+                    raise RecordingError(
+                        f"{self.path}: unknown format; allowed: CSV (also compressed with gzip), ROS bag, MATLAB file, "
+                        "NumPy archive, cisst collector, LCM log"
+                    )
+                encoding = "utf-16" if is_utf16 else "utf-8-sig"
                 text = io.TextIOWrapper(content, encoding)
                 for number, line in enumerate(iter(partial(text.readline, _MAX_LINE + 1), "")):
                     if len(line) > _MAX_LINE:
@@ -102,11 +111,6 @@ class CsvFile(NamedTuple):
                 f"{self.path}, line {line}: the first row has no comma. Separate cells by commas and use a point as "
                 "the decimal separator."
             )
-
-
-def is_utf16(start: bytes) -> bool:
-    """Returns whether a text begins with the byte-order mark of UTF-16."""
-    return start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
 
 
 def is_comment(cells: Sequence[str]) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +14,6 @@ from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import open_input
 from dvrk_drake.progress import Progress, step_progress
-from dvrk_drake.recordings.csv_rows import GZIP_MAGIC, is_utf16
 from dvrk_drake.recordings.reader_cisst import is_collector_file, read_collector
 from dvrk_drake.recordings.reader_csv import read_csv
 from dvrk_drake.recordings.reader_lcm import is_lcm_log, read_status_log
@@ -25,7 +23,7 @@ from dvrk_drake.recordings.reader_options import FileOptions
 from dvrk_drake.recordings.reader_rosbag import is_ros_bag, read_ros_bag
 from dvrk_drake.recordings.recording import FileCoordinates, Recording
 
-#: Number of bytes at the beginning of a text file that must not contain a null byte.
+#: Number of bytes at the beginning of a file that are searched for content.
 _HEAD = 4096
 
 
@@ -183,21 +181,4 @@ def detect_format(path: Path) -> Format:
             f"{path} is a folder without a recording; allowed: ROS bag (.mcap, .db3, .bag), MATLAB files (.mat), NumPy "
             "archives (.npz), LeRobot data set"
         )
-    if head.startswith(GZIP_MAGIC):
-        head = _decompressed(path, head)
-    if found is FORMATS[-1] and b"\0" in head and not is_utf16(head):
-        raise RecordingError(
-            f"{path}: unknown format; allowed: CSV, ROS bag, MATLAB file, NumPy archive, cisst collector, LCM log"
-        )
     return found
-
-
-def _decompressed(path: Path, head: bytes) -> bytes:
-    """Returns the beginning of the content of a gzip file. `head` is the beginning of the file."""
-    try:
-        content = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16).decompress(head, _HEAD)
-    except zlib.error as error:
-        raise RecordingError(f"{path} is not a complete gzip file: {error}") from error
-    if b"\0" in content and not is_utf16(content):
-        raise RecordingError(f"{path}: only a CSV may be compressed with gzip. Decompress the file first with gunzip.")
-    return content

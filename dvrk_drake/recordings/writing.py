@@ -91,28 +91,13 @@ def convert(
     assumed: tuple[str, ...] = ()
     if not recording.file_coordinates:
         assumed = ("coordinates were not stated, read as joint coordinates (default)",)
-    return dataclasses.replace(recording, notes=(*recording.notes, *assumed, *_properties(recording)))
+    return dataclasses.replace(recording, notes=(*recording.notes, *assumed, _times(recording)))
 
 
-def _properties(recording: Recording) -> list[str]:
-    """Returns notes on times and repeated rows, which affect the next command."""
-    notes = []
-    if recording.t is None:
-        notes.append("without times, read as static poses; for a motion, give its sampling rate with --rate HZ")
-        return notes
-    steps = np.diff(recording.t)
-    interval = f", median interval {1e3 * np.median(steps):.4g} ms" if len(steps) else ""
-    notes.append(f"t from {recording.t[0]:g} to {recording.t[-1]:g} s{interval}")
-    if np.any(steps <= 0):
-        first = recording.where(1 + int(np.argmax(steps <= 0)))
-        notes.append(
-            f"t does not increase in all rows ({np.sum(steps == 0)} equal, {np.sum(steps < 0)} smaller than the "
-            f"previous t; first: {first}). The rows are kept, but identify refuses a motion with such times."
-        )
-    table = np.hstack([block for block in (recording.q, recording.qd, recording.tau) if block is not None])
-    if repeats := int(np.sum(np.all(np.diff(table, axis=0) == 0, axis=1))):
-        notes.append(
-            f"{repeats} of {len(recording)} rows repeat the previous row (sampled faster than the arm measures); these "
-            "rows are kept"
-        )
-    return notes
+def _times(recording: Recording) -> str:
+    """Returns a note on the times. `check` reports faults of the times and repeated rows."""
+    t = recording.t
+    if t is None:
+        return "without times, read as static poses; for a motion, give its sampling rate with --rate HZ"
+    interval = f", median interval {1e3 * np.median(np.diff(t)):.4g} ms" if len(t) > 1 else ""
+    return f"t from {t[0]:g} to {t[-1]:g} s{interval}"

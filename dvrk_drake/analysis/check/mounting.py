@@ -114,7 +114,7 @@ def _findings(arm: Arm, gravity: NDArray[np.float64], offsets: NDArray[np.float6
     if not np.array_equal(gravity, arm.gravity):
         vector, stated = (" ".join(f"{x:.3g}" for x in g + 0.0) for g in (gravity, arm.gravity))
         what = f"gravity acts along ({vector}) m/s^2 in the base frame, not along ({stated}). {used}"
-        advice = f"Confirm it with --gravity {vector}, or state it in the arm file."
+        advice = f"State it with identify --gravity {vector}, or in the arm file."
         yield Finding("warning", "gravity direction", arm.name, what, advice)
     for j in np.flatnonzero(offsets):
         name, degrees = arm.joint_names[j], np.rad2deg(offsets[j])
