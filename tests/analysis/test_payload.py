@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from command_output import messages
 from loaded_arm import two_days
-from pydrake.multibody.tree import MultibodyForces, SpatialInertia
+from pydrake.multibody.tree import MultibodyForces
 from report_pages import printed
 
 import dvrk_drake as dvrk
@@ -324,11 +324,11 @@ def test_known_mass_at_the_flange_of_another_robot(shared_data):
     model = dvrk.identify(dvrk.read_recording(folder / "motion_30s.csv", arm), arm).model
     unloaded = dvrk.read_recording(folder / "motion_50s_unloaded.csv", arm).select(slice(0, 2000))
     grid, flange = Observations(unloaded, arm).grid, link_inertias(arm)[-1]
-    nominal = flange.to_spatial_inertia()
-    with_mass = SpatialInertia(nominal)
-    with_mass += SpatialInertia.PointMass(mass, position)
-    motion = grid.q, grid.v, grid.vd
-    with_it, without = (plant_inverse_dynamics(arm, *motion, {flange.link: M}) for M in (with_mass, nominal))
+    with_mass = LinkInertia(flange.link, flange.parameters + point_mass_parameters(mass, position))
+    with_it, without = (
+        plant_inverse_dynamics(arm, grid.q, grid.v, grid.vd, {flange.link: link.to_spatial_inertia()})
+        for link in (with_mass, flange)
+    )
     added = np.column_stack([np.interp(grid.row_times, grid.t, x) for x in (with_it - without).T])
     loaded = dataclasses.replace(unloaded, tau=unloaded.tau + added)
     payload = dvrk.payload(None, loaded, model, flange.link).payload
