@@ -33,20 +33,21 @@ class Layout(NamedTuple):
 
     def columns(self, n: int) -> list[str]:
         """Returns the names of the columns for n joints, e.g. "q1". A column that is ignored has the name ""."""
-        return [
-            name
-            for quantity in self.quantities
-            for name in (*(f"{quantity}{i}" for i in range(1, n + 1)), *[""] * self.gripper)
-        ]
+        joints = [*map(str, range(1, n + 1)), *[""] * self.gripper]
+        return [joint and f"{quantity}{joint}" for quantity in self.quantities for joint in joints]
 
 
-#: Motions of WPI: 21 columns (https://github.com/WPI-AIM/dvrk_dynamics_identification).
-WPI_MOTION = Layout(("q", "qd", "tau"), num_joints=7, rate=200.0, coordinates="wpi", package_arms=True)
 #: Static poses of WPI: array of 8 x 2 x N (https://github.com/WPI-AIM/dvrk_gravity_comp), as a table of 16 columns.
 WPI_POSES = Layout(("q", "tau"), num_joints=7, gripper=True)
-#: Known layouts, in the order in which they are tried. The script `dvrk_ecm_psm_gc_collect.py` of the dVRK
-#: (https://github.com/jhu-dvrk/dvrk_python) writes positions and efforts of the first three joints.
-LAYOUTS = (WPI_MOTION, Layout(("q", "qd", "tau")), Layout(("q", "tau")), WPI_POSES)
+#: Known layouts, in the order in which they are tried.
+LAYOUTS = (
+    # Motions of WPI (https://github.com/WPI-AIM/dvrk_dynamics_identification).
+    Layout(("q", "qd", "tau"), num_joints=7, rate=200.0, coordinates="wpi", package_arms=True),
+    Layout(("q", "qd", "tau")),
+    # Script `dvrk_ecm_psm_gc_collect.py` of the dVRK (https://github.com/jhu-dvrk/dvrk_python), for three joints.
+    Layout(("q", "tau")),
+    WPI_POSES,
+)
 
 
 def find_layout(width: int, arm: Arm | None, n: int) -> Layout | None:

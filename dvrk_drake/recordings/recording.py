@@ -164,7 +164,9 @@ class Recording:
             return ""
         if self.qd is not None:
             qd = self.qd
-        elif self.t is not None and len(self) > 1 and self.has_increasing_times and self._is_continuous(arm):
+        elif self.t is None or len(self) < 2 or not self.has_increasing_times:
+            return ""
+        elif float(np.median(np.diff(self.t))) < MAX_INTERVAL or self.is_path(arm):
             qd = np.diff(self.q, axis=0) / np.diff(self.t)[:, None]
         else:
             return ""
@@ -173,9 +175,6 @@ class Recording:
         joint = int(np.argmax(share))
         unit = "m/s" if arm.prismatic[joint] else "rad/s"
         return f"joint {joint + 1} at {speed[joint]:.2g} {unit} RMS" if share[joint] > 1 else ""
-
-    def _is_continuous(self, arm: Arm) -> bool:
-        return float(np.median(np.diff(np.asarray(self.t)))) < MAX_INTERVAL or self.is_path(arm)
 
     def is_path(self, arm: Arm) -> bool:
         """Returns whether the positions are at least `MIN_ROWS` rows in small steps, as in a motion.

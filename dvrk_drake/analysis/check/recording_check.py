@@ -241,7 +241,7 @@ def _time(observations: Observations, kind: str) -> list[Finding]:
     if t is None:
         if qd is not None and np.max(np.sqrt(np.mean(qd**2, axis=0))) > REST_SPEED[0]:
             what = "the arm moves (qd), but the rows have no times t"
-            advice = "The rows are treated as poses. Add t [s], the time of each row, or give --rate, to use them as a motion."
+            advice = "The rows are treated as poses. For a motion, add the time t [s] of each row, or give --rate."
             return [Finding("warning", "no times", "t", what, advice)]
         return []
     decreasing = np.flatnonzero(np.diff(t) <= 0)
