@@ -17,7 +17,6 @@ from dvrk_drake.cli.app import (
     EnvironmentFile,
     Gravity,
     Instrument,
-    Overwrite,
     Seconds,
     Seed,
     Table,
@@ -25,7 +24,8 @@ from dvrk_drake.cli.app import (
     whole_number,
     with_instrument,
 )
-from dvrk_drake.cli.support import Steps, check_output, load_environment, mounted, print_written, suggest
+from dvrk_drake.cli.report import Results
+from dvrk_drake.cli.support import Steps, check_output, load_environment, mounted, print_written
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.workers import local_executor
 
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 #: Default rate of the rows of --csv [Hz].
 DEFAULT_RATE = 200.0
+_RESULTS = Results()
 
 
 @app.command(group=IDENTIFY)
@@ -58,7 +59,7 @@ def excite(
     table: Table = None,
     environment: EnvironmentFile = None,
     gravity: Gravity = None,
-    overwrite: Overwrite = False,
+    results: Results = _RESULTS,
 ) -> None:
     """Design a motion or static poses for the identification of an arm.
 
@@ -86,7 +87,7 @@ def excite(
     import numpy as np
 
     from dvrk_drake.recordings.writer_csv import write_csv
-    from dvrk_drake.reports.terminal import make_console, print_answer
+    from dvrk_drake.reports.excitation import motion_page
 
     of_motion = {
         "model": model,
@@ -102,15 +103,15 @@ def excite(
     if static is not None:
         if given := [f"--{name}" for name, value in of_motion.items() if value is not None]:
             raise ExcitationError(f"{' and '.join(given)} cannot be used with --static")
-        check_output(output, overwrite=overwrite)
+        results.check(output=output)
         around = load_environment(table, environment)
-        _select_poses(arm, output, static, seed, margin, effort, _positions(position or []), around, gravity)
+        _select_poses(arm, output, static, seed, margin, effort, _positions(position or []), around, gravity, results)
         return
     if csv is None and rate is not None:
         raise ExcitationError("--rate requires --csv")
-    check_output(output, overwrite=overwrite)
+    results.check(model, output=output)
     if csv is not None:
-        check_output(csv, output, overwrite=overwrite)
+        check_output(csv, output, overwrite=results.overwrite)
     rate = DEFAULT_RATE if rate is None else rate
     if not 1.0 <= rate <= 10_000.0:
         raise ExcitationError(f"--rate is {rate:g}; allowed: 1 to 10000")
@@ -146,19 +147,9 @@ def excite(
         t = np.arange(round(motion.duration * rate) + 1) / rate
         q, v = motion.evaluate(t)[:2]
         write_csv(csv, {"t": t, "q": q, "qd": v}, moved, {"coordinates": "joint", "arm": moved.name})
-    console = make_console()
-    print_answer(
-        console,
-        f"{moved.name}: motion of {motion.duration:g} s. Expected error of predicted efforts: "
-        f"{100 * design.expected_error:.1f} % ({100 * design.random_error:.1f} % with the best random motion).",
-    )
     with_model = "" if model is None else f" --model {shlex.quote(model)}"
-    suggest("dvrk-drake collect motion " + shlex.join([output, "--arm", arm]) + f"{with_model} --rehearse")
-    console.print(
-        f"Base parameters known to 10 %: {design.known_parameters} of {design.num_parameters}. Condition number: "
-        f"{design.condition_number:.3g}. Information per parameter (log-determinant): {design.log_determinant:.2f}."
-    )
-    print_written(output)
+    collect = "dvrk-drake collect motion " + shlex.join([output, "--arm", arm]) + f"{with_model} --rehearse"
+    results.show(motion_page(design, next_step=collect), model, saved=output)
     if csv is not None:
         print_written(csv)
 
@@ -173,10 +164,11 @@ def _select_poses(
     positions: dict[str, tuple[float, float]],
     environment: Environment,
     gravity: tuple[float, float, float] | None,
+    results: Results,
 ) -> None:
     """Selects static poses, writes the pose file and prints the expected errors."""
     from dvrk_drake.analysis.excitation.static_poses import MARGIN
-    from dvrk_drake.reports.terminal import make_console, print_answer
+    from dvrk_drake.reports.excitation import poses_page
 
     limits = dvrk.MotionLimits(
         margin=MARGIN if margin is None else margin, effort=effort, positions=positions, environment=environment
@@ -185,16 +177,9 @@ def _select_poses(
     with Steps("selecting poses") as steps:
         design = dvrk.design_poses(arm, count, limits=limits, seed=seed, progress=steps)
     design.save(output, overwrite=True)
-    console = make_console()
-    print_answer(
-        console,
-        f"{arm.name}: {count} static poses. Expected error of predicted holding efforts: "
-        f"{100 * design.expected_error:.1f} % ({100 * design.random_error:.1f} % with {count} random poses).",
-    )
     recording = str(Path(output).with_suffix(".csv"))
-    suggest("dvrk-drake collect poses " + shlex.join([output, "--arm", name, "--output", recording]))
-    console.print(f"Gravity parameters known to 10 %: {design.known_parameters} of {design.num_parameters}.")
-    print_written(output)
+    collect = "dvrk-drake collect poses " + shlex.join([output, "--arm", name, "--output", recording])
+    results.show(poses_page(design, next_step=collect), saved=output)
 
 
 def _positions(texts: list[str]) -> dict[str, tuple[float, float]]:

@@ -14,6 +14,8 @@ from dvrk_drake.reports.provenance import Provenance
 #: Mapping from the name of a result's class to the module of its page and the function in it that returns the page:
 #: `function(result) -> Page`. Modules are imported when they are needed.
 _MAKERS = {
+    "ExcitationDesign": ("excitation", "motion_page"),
+    "StaticPoseDesign": ("excitation", "poses_page"),
     "CompensationComparison": ("export", "compensation_page"),
     "ExternalForce": ("external_force", "force_page"),
     "PayloadIdentification": ("payload", "payload_page"),

@@ -1,4 +1,4 @@
-"""Reports of study, tune, transparency, payload and compare-gc: content, and layout in a browser."""
+"""Reports of study, tune, transparency, payload, excite and compare-gc: content; layout of all pages in a browser."""
 
 import hashlib
 import re
@@ -6,6 +6,7 @@ import tempfile
 from dataclasses import replace
 from functools import cache
 from importlib import import_module
+from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ import pytest
 from command_output import refusal
 from figure_rules import checked_figures
 from loaded_arm import two_days
-from report_checks import check_report
+from report_checks import ALL_VIEWS, check_report
 from report_results import operator_forces, study_results, tuning_result
 
 import dvrk_drake as dvrk
@@ -22,6 +23,7 @@ from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
 from dvrk_drake.models.files import Reportable
+from dvrk_drake.reports.excitation import motion_page, poses_page
 from dvrk_drake.reports.export import compensation_page
 from dvrk_drake.reports.html_file import render_html, write_html
 from dvrk_drake.reports.image_files import write_images
@@ -55,14 +57,32 @@ def payload():
     return dvrk.payload(reference, loaded, dvrk.identify(reference, dvrk.load_arm("psm")).model)
 
 
+@cache
+def motion_design():
+    return dvrk.design_excitation(dvrk.load_arm("psm"), duration=4.0, period=4.0, harmonics=2, starts=1)
+
+
 PAGES = {
+    "excite": lambda: motion_page(motion_design()),
+    "excite-poses": lambda: poses_page(dvrk.design_poses(dvrk.load_arm("mtml"), 8)),
     "study": lambda: study_page(*study_results(), study_path="study.yaml"),
     "tune": lambda: tuning_page(tuning_result()),
     "transparency": lambda: transparency_page(*operator_forces()),
     "compare-gc": lambda: compensation_page(comparison(), file_name="gc.json", model_name="model.yaml"),
     "payload": lambda: payload_page(payload()),
 }
-SLOW = {"payload"}
+SLOW = {"payload", "excite", "excite-poses"}
+#: Commands whose pages are checked at all widths, in light and dark. Calibrate writes pages of identify and validate.
+COMMANDS = {
+    "identify_poses": ["identify {samples}/mtm_poses.csv --arm mtmr --output model.yaml --report page.html"],
+    "identify_motion": ["identify {samples}/psm_motion.csv --arm psm --output model.yaml --report page.html"],
+    "validate": [
+        "identify {samples}/mtm_poses.csv --arm mtmr --output model.yaml",
+        "validate {samples}/mtm_other_poses.csv --model model.yaml --report page.html",
+    ],
+    "demo": ["demo --folder demo_output"],
+    "reproduce": ["reproduce table1 --folder reproduction"],
+}
 
 
 def blocks(page, kind):
@@ -77,6 +97,16 @@ def test_page_has_answer_tables_plots_and_next_step(name, tmp_path, monkeypatch)
     assert "--verbose" not in render_html(page, ORIGIN)
     with checked_figures(monkeypatch):
         assert [path.stem for path in write_images(page, tmp_path)] == [plot.name for plot in blocks(page, Plot)] != []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", COMMANDS)
+def test_pages_at_all_widths(name, open_page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for command in COMMANDS[name]:
+        assert main(command.format(samples=files("dvrk_drake") / "samples").split()) == 0
+    (path,) = [*tmp_path.glob("page.html"), *tmp_path.glob("*/report.html"), *tmp_path.glob("*/index.html")]
+    check_report(open_page, path, ALL_VIEWS)
 
 
 @pytest.mark.parametrize("name", PAGES)

@@ -13,12 +13,13 @@ CUT = """[...document.querySelectorAll(".scroll")].filter((one) => one.scrollWid
   .map((one) => one.parentElement.textContent.slice(0, 60))"""
 
 
-#: Widths [px] and colours at which a report is checked.
+#: Widths [px] and colours at which a report is checked, and those at which the pages of all commands are.
 VIEWS = ((1920, "light"), (800, "light"), (1280, "dark"))
+ALL_VIEWS = tuple((width, colours) for width in (1920, 800, 1280) for colours in ("light", "dark"))
 
 
-def check_report(open_page, path):
-    """Opens a report in all `VIEWS` and checks it.
+def check_report(open_page, path, views=VIEWS):
+    """Opens a report in all views, checks it, and writes a picture of each view beside it.
 
     Checks errors, requests, overlaps, cut tables, the width of the page, the smallest text of the plots, the size of
     the file, and the headings of the printed page. All sections and tables are opened.
@@ -26,7 +27,7 @@ def check_report(open_page, path):
     Returns:
         The page, 1280 px wide.
     """
-    for width, colours in VIEWS:
+    for width, colours in views:
         opened = open_page(path, width=width, color_scheme=colours)
         opened.wait_for("document.documentElement.dataset.ready === 'yes'")
         opened.page.evaluate("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
@@ -40,6 +41,7 @@ def check_report(open_page, path):
             "[...document.querySelectorAll('.canvas text')].map((text) => parseFloat(getComputedStyle(text).fontSize))"
         )
         assert min(sizes, default=12) >= 12, "9 pt are 12 px"
+        opened.page.screenshot(path=path.with_name(f"{path.stem}_{width}_{colours}.png"), full_page=True)
     assert path.stat().st_size < 10e6
     check_resized(opened)
     text = printed_text(opened, path.parent)

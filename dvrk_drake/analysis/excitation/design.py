@@ -25,6 +25,7 @@ from dvrk_drake.analysis.excitation.random_motion import (
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.files import Reportable
 from dvrk_drake.progress import Progress, step_progress
 
 #: Number of times per harmonic at which the information is computed and the efforts are limited. The information
@@ -51,10 +52,11 @@ _CONTRACTION, _MAX_CONTRACTIONS = 0.99, 150
 
 
 @dataclass(frozen=True, eq=False)
-class ExcitationDesign:
+class ExcitationDesign(Reportable):
     """Designed motion and the information that it gives.
 
     Attributes:
+        arm: Arm of the motion.
         motion: Motion within all limits.
         expected_error: Expected RMS error of efforts that a model predicts after this motion, relative to the RMS
             efforts, see `MotionInformation.expected_error`.
@@ -65,6 +67,7 @@ class ExcitationDesign:
         random_error: Smallest expected error of the random motions from which the optimisation started.
     """
 
+    arm: Arm
     motion: PeriodicMotion
     expected_error: float
     known_parameters: int
@@ -166,6 +169,7 @@ def design_excitation(
     state = state_of(motion, INFORMATION_TIMES * harmonics)
     criterion, matrix = information.criterion, information.matrix(state, period)
     return ExcitationDesign(
+        arm=arm,
         motion=motion,
         expected_error=criterion.after(matrix),
         known_parameters=criterion.known_parameters(matrix),

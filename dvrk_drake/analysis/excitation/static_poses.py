@@ -24,7 +24,7 @@ from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.approach import approach_offset, offset_pose
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.environment import Environment
-from dvrk_drake.models.files import refuse_existing
+from dvrk_drake.models.files import Reportable, refuse_existing
 from dvrk_drake.models.plant import inverse_dynamics
 from dvrk_drake.progress import Progress, step_progress
 
@@ -56,7 +56,7 @@ _BLOCKED = 1e3
 
 
 @dataclass(frozen=True, eq=False)
-class StaticPoseDesign:
+class StaticPoseDesign(Reportable):
     """Static poses for `collect` and the information that they give.
 
     Attributes:

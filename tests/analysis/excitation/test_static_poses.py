@@ -195,7 +195,7 @@ def test_command_writes_a_pose_file(tmp_path, monkeypatch, capsys):
     assert "MTML: 8 static poses. Expected error of predicted holding efforts:" in out
     assert "% with 8 random poses" in out
     assert "Next: dvrk-drake collect poses p.yaml --arm mtml --output p.csv" in out
-    assert "Gravity parameters known to 10 %:" in out
+    assert "gravity parameters known to 10 %" in out
     assert load_poses("p.yaml", dvrk.load_arm("mtml")).shape == (8, 7)
     for options, message in (
         (["--output", "p.yaml"], "p.yaml already exists"),
