@@ -75,7 +75,7 @@ def poses_page(design: StaticPoseDesign, *, next_step: str | None = None) -> Pag
         ("gravity parameters known to 10 %", f"{design.known_parameters} of {design.num_parameters}"),
     ]
     count = np.arange(1.0, len(poses) + 1)
-    views: list[Block] = [_view(arm, count, poses), _position_plot(arm, count, poses, "pose", "dots", time=True)]
+    views: list[Block] = [_view(arm, count, poses), _position_plot(arm, count, poses, "pose", "circles", time=True)]
     return Page(
         f"Designed static poses of {arm.name}",
         answer,

@@ -60,7 +60,7 @@ def playback(
     assert poses is not None
     period = float(times[1] - times[0])
     meshcat = start_meshcat(arm)
-    links, overlay = DrawnArm(arm, meshcat, f"{arm.name.lower()}/links"), ArmOverlay(arm, meshcat)
+    links, overlay = DrawnArm(arm, meshcat, f"{arm.name.lower()}/links"), ArmOverlay(arm, meshcat, trace=False)
     if ghosts is not None:
         overlay.add_ghost(_GHOST, _GHOST_COLOUR)
     meshcat.StartRecording(frames_per_second=1 / period)

@@ -94,6 +94,8 @@ def plotly_figure(plot: Plot) -> go.Figure:
     names: set[str] = set()
     for k, panel in enumerate(plot.panels):
         _draw(figure, panel, {"row": k // columns + 1, "col": k % columns + 1}, names)
+    if columns > 1:  # a panel is half as wide, and labels such as -0.005 must not overlap
+        figure.update_xaxes(nticks=5, selector=lambda axis: axis.type != "log")
     figure.update_annotations(font_size=13)
     if columns == 1:
         figure.update_annotations(xanchor="left", x=0.0)
@@ -186,12 +188,14 @@ def _draw_guide(figure: go.Figure, guide: Guide, at: dict[str, int], entry: dict
     add_line, add_range = (
         (figure.add_vline, figure.add_vrect) if guide.axis == "x" else (figure.add_hline, figure.add_hrect)
     )
+    # Plotly's default draws no guide in axes to which the curves are added later.
+    place: dict[str, Any] = {**at, "exclude_empty_subplots": False}
     dash = "dash" if guide.dashed else "solid"
     if guide.high is None:
-        add_line(guide.low, line={"color": guide.colour, "dash": dash, "width": 1.2}, **at)
+        add_line(guide.low, line={"color": guide.colour, "dash": dash, "width": 1.2}, **place)
         look: dict[str, Any] = {"mode": "lines", "line": {"color": guide.colour, "dash": dash, "width": 1.2}}
     else:
-        add_range(guide.low, guide.high, fillcolor=guide.colour, opacity=0.3, line_width=0, layer="below", **at)
+        add_range(guide.low, guide.high, fillcolor=guide.colour, opacity=0.3, line_width=0, layer="below", **place)
         marker = {"symbol": "square", "size": 12, "color": _transparent(guide.colour, 0.4)}
         look = {"mode": "markers", "marker": marker}
     if entry["showlegend"]:

@@ -9,10 +9,11 @@ from pydrake.math import RigidTransform
 from report_checks import check_report, printed_text
 
 from dvrk_drake.errors import DvrkDrakeError
-from dvrk_drake.reports.colours import MEASURED, SERIES
+from dvrk_drake.reports.colours import LIMIT, MEASURED, SERIES
 from dvrk_drake.reports.html_file import write_html
 from dvrk_drake.reports.page import Command, Page, Plot, Scene, Section, Table, Text, Verdict
-from dvrk_drake.reports.plot import Bars, Curve, Panel, category_panel
+from dvrk_drake.reports.plot import Bars, Curve, Guide, Panel, category_panel
+from dvrk_drake.reports.plotly_figures import plotly_figure
 from dvrk_drake.reports.provenance import Provenance
 from dvrk_drake.systems.arm_view.page import start_meshcat
 
@@ -202,6 +203,13 @@ def test_columns_of_numbers_are_aligned_right():
     assert Table(("a", "b"), [("x", "inf")], right=[False, True]).aligned_right == [False, True]
     with pytest.raises(ValueError, match="a row has 1 cells, the header has 2"):
         Table(("a", "b"), [("1",)])
+
+
+def test_guide_is_drawn_in_all_panels():
+    """Plotly's default draws no guide in axes whose curves follow."""
+    marks = [Guide("y", 0.5, None, LIMIT), Curve("x", [0, 1], [0, 1], MEASURED)]
+    plot = Plot("limits", "Limits", [Panel(name, marks) for name in "abc"], columns=2)
+    assert len(plotly_figure(plot).layout.shapes) == 3
 
 
 def test_failed_write_leaves_no_file(tmp_path):

@@ -33,8 +33,9 @@ def check_report(open_page, path, views=VIEWS):
         opened.page.evaluate("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
         opened.wait_for(FITS)
         assert not opened.errors and not opened.requests
-        assert not opened.overlaps(BOXES)
-        assert not opened.overlaps(PLOT_TEXT)
+        for selector in (BOXES, PLOT_TEXT):
+            overlaps = opened.overlaps(selector)
+            assert not overlaps, f"overlaps at {width} px: {overlaps[:5]}"
         assert not opened.page.evaluate(CUT), f"a table is cut at {width} px"
         assert opened.page.evaluate("document.documentElement.scrollWidth <= innerWidth"), "must not scroll sideways"
         sizes = opened.page.evaluate(

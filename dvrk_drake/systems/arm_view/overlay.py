@@ -58,8 +58,14 @@ class ArmOverlay:
         True
     """
 
-    def __init__(self, arm: Arm, meshcat: Meshcat) -> None:
-        """Adds the overlay. Nothing is visible except the RCM of the arm, if it has one."""
+    def __init__(self, arm: Arm, meshcat: Meshcat, *, trace: bool = True) -> None:
+        """Adds the overlay. Nothing is visible except the RCM of the arm, if it has one.
+
+        Args:
+            arm: Arm that the overlay describes.
+            meshcat: Meshcat with the arm.
+            trace: Whether to draw the trace of the tip.
+        """
         self.arm, self.meshcat = arm, meshcat
         self._path = f"{arm.name.lower()}/overlay"
         meshcat.Delete(self._path)
@@ -74,7 +80,7 @@ class ArmOverlay:
         self._ghosts: dict[str, GhostArm] = {}
         self._trace: deque[NDArray[np.float64]] = deque(maxlen=TRACE_POINTS)
         self._state, self._effort_colors = PanelText(meshcat), PanelText(meshcat)
-        self._scale = 1.0
+        self._scale, self._has_trace = 1.0, trace
         self.show_efforts(False)
         if arm.frames.remote_center:
             rcm = self._plant.GetFrameByName(arm.frames.remote_center).CalcPoseInWorld(self._context)
@@ -121,7 +127,8 @@ class ArmOverlay:
         for name, ghost in self._ghosts.items():
             ghost.draw_beside(poses.get(name), q, time)
         self._move_efforts(time)
-        self._draw_trace()
+        if self._has_trace:
+            self._draw_trace()
 
     def set_state(self, text: str) -> None:
         """Shows a text of at most 40 characters in the control panel, e.g. the state of the arm. "" shows nothing."""

@@ -135,10 +135,10 @@ def page_html(
     return page.replace("</body>", captions + "</body>", 1) if phases or legend else page
 
 
-#: Texts in the upper left corner of a page, which change with the time of the animation. The control panel is right.
+#: Texts in the lower left corner of a page, which change with the time of the animation. The controls are above.
 _CAPTIONS = """
 <style>
-  #captions { position: fixed; left: 0; top: 0; max-width: calc(100% - 16px); padding: 6px 12px; color: #141a21;
+  #captions { position: fixed; left: 0; bottom: 0; max-width: calc(100% - 16px); padding: 6px 12px; color: #141a21;
               background: rgba(255, 255, 255, 0.85); font: 15px/1.5 system-ui, "DejaVu Sans", sans-serif; }
   #captions i { display: inline-block; width: 12px; height: 12px; margin-right: 8px; border: 1px solid #141a21; }
   #captions i.scale { width: 90px; margin: 0 6px 0 2px; }
