@@ -24,6 +24,14 @@ if TYPE_CHECKING:
     from dvrk_drake.processes.connection import ArmConnection
     from dvrk_drake.processes.live_status import LiveLine
 
+StopOnContact = Annotated[
+    float | None,
+    Parameter(
+        metavar="N",
+        help="Hold the arm if the external effort shows a contact, with N expected false alarms per hour, e.g. 0.1. It "
+        "requires --model, identified from a motion.",
+    ),
+]
 _TASK = one_of("Task (one is required)")
 
 
@@ -100,6 +108,7 @@ def collect_poses(
     both_sides: Annotated[bool, Parameter(negative="--no-both-sides")] = True,
     traverse_time: Seconds = 5.0,
     max_effort: Annotated[float | None, Parameter(metavar="SHARE")] = None,
+    stop_on_contact: StopOnContact = None,
     yes: Annotated[bool, Parameter(show_default=False)] = False,
 ) -> None:
     """Move an arm to the poses of a file, and record its efforts at rest.
@@ -126,7 +135,9 @@ def collect_poses(
         from dvrk_drake.processes.collector import CollectionSettings
 
         settings = CollectionSettings(traverse_time, both_sides, **given)
-        connection, line = _connect(controlled, keys=controlled.is_ros, confirms=controlled.is_ros and not yes)
+        connection, line = _connect(
+            controlled, keys=controlled.is_ros, confirms=controlled.is_ros and not yes, stop_on_contact=stop_on_contact
+        )
     try:
         with interrupt_ends_process():
             collector = connection.collect_poses(poses, output, settings)
@@ -157,6 +168,7 @@ def collect_motion(
     controlled: ControlledArm,
     output: Annotated[str | None, Parameter(metavar="FILE.csv", group=_TASK)] = None,
     rehearse: Annotated[bool, Parameter(show_default=False, group=_TASK)] = False,
+    stop_on_contact: StopOnContact = None,
 ) -> None:
     """Move an arm along a motion and record its efforts.
 
@@ -173,7 +185,7 @@ def collect_motion(
     if output is not None:
         check_output(output, motion, controlled.model or "", overwrite=True)
     with interrupt_ends_process():
-        connection, line = _connect(controlled, keys=True)
+        connection, line = _connect(controlled, keys=True, stop_on_contact=stop_on_contact)
     try:
         with interrupt_ends_process():
             played = connection.play(motion, output)
@@ -200,13 +212,16 @@ def collect_motion(
         suggest(f"dvrk-drake collect motion {motion} {controlled.as_text()} --output {recording}")
 
 
-def _connect(controlled: ControlledArm, *, keys: bool, confirms: bool = False) -> tuple[ArmConnection, LiveLine]:
+def _connect(
+    controlled: ControlledArm, *, keys: bool, confirms: bool = False, stop_on_contact: float | None = None
+) -> tuple[ArmConnection, LiveLine]:
     """Returns the connection to the arm, with a dialog on the terminal, and its status line.
 
     Args:
         controlled: Options of the command.
         keys: Whether the Enter key has an effect.
         confirms: Whether the operator must confirm the first motion, if there is a terminal.
+        stop_on_contact: See `dvrk_drake.connect`.
     """
     from dvrk_drake.processes.arm_session import Dialog
     from dvrk_drake.processes.live_status import LiveLine
@@ -222,5 +237,6 @@ def _connect(controlled: ControlledArm, *, keys: bool, confirms: bool = False) -
             while not connection.dialog.stopped() and not enter():
                 time.sleep(0.02)
 
-    connection = connect_arm(controlled, Dialog(confirm=confirm, enter=enter, report=line.report, show=line.show))
+    dialog = Dialog(confirm=confirm, enter=enter, report=line.report, show=line.show)
+    connection = connect_arm(controlled, dialog, stop_on_contact)
     return connection, line

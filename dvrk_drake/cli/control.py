@@ -210,8 +210,8 @@ def _friction_compensator(
     return compensator
 
 
-def connect_arm(controlled: ControlledArm, dialog: Dialog) -> ArmConnection:
-    """Returns the connection to the arm that the options of a command define.
+def connect_arm(controlled: ControlledArm, dialog: Dialog, stop_on_contact: float | None = None) -> ArmConnection:
+    """Returns the connection to the arm that the options of a command define. See `dvrk_drake.connect`.
 
     Use the connection within `interrupt_ends_process`. Ctrl-C then ends the process at once, until this process
     commands the arm. From then on, `dialog.stopped` returns true after Ctrl-C.
@@ -235,4 +235,4 @@ def connect_arm(controlled: ControlledArm, dialog: Dialog) -> ArmConnection:
         if warning := model_warning(controlled.model, model):
             print_warning(warning)
     dialog = replace(dialog, stopped=lambda: any(handler() for handler in handlers))
-    return controlled.connect(dialog, model=model, reset=controlled.reset, ready=ready)
+    return controlled.connect(dialog, model=model, reset=controlled.reset, ready=ready, stop_on_contact=stop_on_contact)

@@ -21,6 +21,7 @@ from dvrk_drake.models.environment import Environment
 from dvrk_drake.models.lcm_messages import MessageKey
 from dvrk_drake.processes.arm_controller import ArmController, GoalController
 from dvrk_drake.processes.arm_operator import reset_fault
+from dvrk_drake.processes.contact_stop import ContactStop
 from dvrk_drake.processes.control import FIRST_WAIT, SILENCE, StatusHandler, control, first_status
 from dvrk_drake.processes.live_status import LiveStatus
 from dvrk_drake.systems.friction_compensator import FrictionCompensator
@@ -75,7 +76,7 @@ class ArmSession:
         model: Model for the control of the arm.
         transport: "lcm" or "ros".
         dialog: Functions for the communication with the operator.
-        lcm_url, key, topic, domain, reset, guard, ready: See `connect`.
+        lcm_url, key, topic, domain, reset, guard, ready, stop_on_contact: See `connect`.
         options: Options of a command line for this arm, for messages.
     """
 
@@ -90,6 +91,7 @@ class ArmSession:
     reset: bool = False
     guard: GuardSettings = field(default_factory=GuardSettings)
     ready: Callable[[], None] = field(default=lambda: None)
+    stop_on_contact: float | None = None
     options: str = ""
 
     def __post_init__(self) -> None:
@@ -164,6 +166,10 @@ class ArmSession:
             stopped, on_status: See `dvrk_drake.processes.control.control`.
             describe: Function that returns the progress for the status line. None: there is no status line.
             report: Function that is called with the live status a few times per second.
+
+        Raises:
+            ControllerError: See `dvrk_drake.processes.control.control`, or something touches the arm.
+            ModelError: The contact cannot be detected with this model, see `ContactStop`.
         """
 
         def show(status: LiveStatus) -> None:
@@ -172,7 +178,10 @@ class ArmSession:
                 self.dialog.show(lambda: f"{describe()}; {status}")
 
         with closing(link):
-            control(link, controller, stopped, show, on_status)
+            handler = on_status
+            if self.stop_on_contact is not None:
+                handler = ContactStop(self.model, self.stop_on_contact, on_status)
+            control(link, controller, stopped, show, handler)
 
     def check_path(
         self, link: ArmLink, q_end: NDArray[np.float64], environment: Environment

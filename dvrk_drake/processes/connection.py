@@ -18,6 +18,7 @@ from dvrk_drake.models.lcm_messages import MessageKey, describe_state
 from dvrk_drake.processes.arm_operator import ArmObservation, observe, stop_arm
 from dvrk_drake.processes.arm_session import ArmSession, Dialog
 from dvrk_drake.processes.collector import CollectionSettings, Collector, collect_poses
+from dvrk_drake.processes.contact_stop import ContactStop
 from dvrk_drake.processes.live_status import LiveStatus
 from dvrk_drake.processes.motion_player import PlayedMotion, play_motion
 from dvrk_drake.processes.recorder import ArmRecorder, LcmRecorder
@@ -245,6 +246,7 @@ def connect(
     guard: GuardSettings | None = None,
     dialog: Dialog | None = None,
     ready: Callable[[], None] = lambda: None,
+    stop_on_contact: float | None = None,
 ) -> ArmConnection:
     """Returns a connection to an arm, whose methods measure, move and control the arm.
 
@@ -265,11 +267,14 @@ def connect(
         dialog: Functions for the communication with the operator. None: there is none, and a motion runs to its end.
         ready: Function that is called before this process commands the arm, e.g. to handle signals and to request
             real-time scheduling. Over ROS 2, it is called before the connection.
+        stop_on_contact: Expected number of false alarms per hour with which this process detects a contact, ends the
+            control and lets the arm hold its pose. It requires a model that was identified from a motion. None:
+            contacts are not detected.
 
     Raises:
-        ModelError: The model cannot be read, or belongs to another arm.
+        ModelError: The model cannot be read, belongs to another arm, or is not suitable for `stop_on_contact`.
         KeyFileError: The key cannot be used.
-        ControllerError: The transport is not known.
+        ControllerError: The transport is not known, or the rate of false alarms is out of range.
 
     Example:
         >>> import dvrk_drake as dvrk
@@ -289,9 +294,13 @@ def connect(
         if warning := model_warning(str(model), used):
             dialog.report(f"warning: {warning}")
     loaded = None if key is None else MessageKey.load(key)
-    return ArmConnection(
+    connection = ArmConnection(
         arm, used, transport, dialog, lcm_url, loaded, topic, domain, reset, guard or GuardSettings(), ready
     )
+    if stop_on_contact is not None:
+        ContactStop(used, stop_on_contact)  # raises an error if the model is not suitable
+        connection.stop_on_contact = stop_on_contact
+    return connection
 
 
 def model_warning(path: str, model: IdentifiedModel) -> str:
