@@ -57,8 +57,8 @@ class ContactStop:
             if period > _MAX_GAP:
                 self._state = self._observer.start()
             self._utime = status.utime
-            measured = (np.array(x) for x in (status.position, status.velocity, status.effort_measured))
-            self._observer.update(self._state, *measured, min(period, _MAX_GAP))
+            q, v, tau = (np.array(x) for x in (status.position, status.velocity, status.effort_measured))
+            self._observer.update(self._state, q, v, tau, min(period, _MAX_GAP))
             self._check(status.arm_name)
         return self._handler(status, time)
 
