@@ -137,18 +137,12 @@ def test_command_writes_csv_and_report(pushed, tmp_path, capsys, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "mass", "frame", "point"),
-    [
-        ("psm_one_105g_parallel", 0.105, "bottom_bar_link", (0.0, 0.165, 0.0563)),
-        ("psm_one_205g_insertion", 0.205, "end_link", (0.0, 0.023, 0.3913)),
-    ],
-)
-def test_weight_is_found_as_a_force(name, mass, frame, point, shared_data, real_model):
-    read = read_recording(shared_data / "trajectories" / f"{name}.csv", PSM, "wpi")
-    effort = estimate_force(read, real_model, frame=frame, point=point, same_day=True).effort[:, :2]
+def test_real_weight_is_found_with_its_inertia(shared_data, real_model):
+    mass, link, point = 0.205, "end_link", (0.0, 0.023, 0.3913)
+    read = read_recording(shared_data / "trajectories" / "psm_one_205g_insertion.csv", PSM, "wpi")
+    effort = estimate_force(read, real_model, frame=link, point=point, same_day=True).effort[:, :2]
     grid, regressor = Observations.for_model(read, real_model).grid, real_model.dynamic_model.regressor
-    k = [link.link for link in regressor.links].index(frame)
+    k = [own.link for own in regressor.links].index(link)
     weight = regressor.regressor(grid.q, grid.v, grid.vd)[..., 10 * k : 10 * k + 10]
     weight = -grid.filter_efforts(grid.at_rows(weight @ point_mass_parameters(mass, np.array(point)), 0))[:, :2]
     assert np.all(np.sqrt(np.mean((effort - weight) ** 2, axis=0)) < 0.25 * np.sqrt(np.mean(weight**2, axis=0)))
