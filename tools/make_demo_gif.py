@@ -19,8 +19,9 @@ FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader
 #: Hides the control panel of Meshcat, and the captions, which are too small for a GIF. `label` writes larger ones.
 HIDE_PANEL = ".dg, #captions, #status-message, #stats-plot { display: none !important; }"
 #: Texts on the pictures, with their colours: the arm, and the ghost while it is visible.
-ARM, GHOST = ("grey: identified model", "#1f1f1f"), ("green: model that was not identified", "#1b6b40")
-TEXT_SIZE = 20
+ARM, GHOST = ("grey: identified model, mode guide", "#1f1f1f"), ("green: model of the SDF, mode gravity", "#1b6b40")
+#: Size of the texts, and height of the bar above the view that shows them [px].
+TEXT_SIZE, BAR = 20, 58
 #: Moves the paused animation to a time [s] and draws it.
 SHOW = """(time) => {
   viewer.animator.pause();
@@ -35,7 +36,7 @@ def frames(page_file: Path, times: np.ndarray, size: tuple[int, int], chromium: 
     pictures = []
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=chromium, args=list(FLAGS))
-        page = browser.new_page(viewport={"width": size[0], "height": size[1]})
+        page = browser.new_page(viewport={"width": size[0], "height": size[1] - BAR})
         page.set_default_timeout(300_000)
         page.goto(page_file.resolve().as_uri())
         page.add_style_tag(content=HIDE_PANEL)
@@ -48,14 +49,15 @@ def frames(page_file: Path, times: np.ndarray, size: tuple[int, int], chromium: 
     return pictures
 
 
-def label(picture: Image.Image, time: float) -> Image.Image:
-    """Adds the captions of the animation at `time` [s] to a picture."""
+def label(view: Image.Image, time: float) -> Image.Image:
+    """Returns a picture with the captions of the animation at `time` [s] above the view."""
+    picture = Image.new("RGB", (view.width, view.height + BAR), "#f4f6f8")
+    picture.paste(view, (0, BAR))
     draw = ImageDraw.Draw(picture)
     font = ImageFont.load_default(TEXT_SIZE)
     phase = "released" if time >= RELEASE_TIME else "held"
     outcomes = (": stays", ": falls") if phase == "released" else ("", "")
     lines = [(text + outcome, colour) for (text, colour), outcome in zip((ARM, GHOST), outcomes, strict=True)]
-    draw.rectangle((0, 0, picture.width, 2.9 * TEXT_SIZE), fill="#f4f6f8")
     for i, (text, colour) in enumerate(lines):
         draw.text((12, 6 + 1.3 * TEXT_SIZE * i), text, fill=colour, font=font)
     draw.text((picture.width - 12, 6), phase.upper(), fill="#1f1f1f", font=font, anchor="ra")
@@ -82,7 +84,7 @@ def main() -> None:
     parser.add_argument("--period", type=float, default=0.1, help="time between two pictures [s]")
     parser.add_argument("--end", type=float, default=5.0, help="time of the last picture [s]")
     parser.add_argument("--size", nargs=2, type=int, default=[560, 460], metavar="pixels", help="width and height")
-    parser.add_argument("--colours", type=int, default=128, help="number of colours")
+    parser.add_argument("--colours", type=int, default=255, help="number of colours")
     parser.add_argument("--chromium", default=shutil.which("chromium") or "chromium", help="program of the browser")
     options = parser.parse_args()
     times = np.arange(0.0, options.end, options.period)

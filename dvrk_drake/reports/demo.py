@@ -47,9 +47,9 @@ def write_demo(result: DemoResult, folder: Path, command: Sequence[str] = ()) ->
         ghost=result.nominal,
         phases=(
             (float(result.time[0]), "held: the controller regulates the pose"),
-            (0.0, "released: gravity compensation only"),
+            (0.0, "released: no desired pose"),
         ),
-        colors={"#a0a4a8": "controlled with the identified model", REFERENCE: "controlled with the model of the SDF"},
+        colors={"#a0a4a8": "identified model, mode guide", REFERENCE: "model of the SDF, mode gravity"},
         title=f"{arm.name} (simulated) - dvrk-drake demo",
     )
     with atomic_write(folder / "arm.html") as stream:
@@ -92,14 +92,14 @@ def demo_page(result: DemoResult, folder: Path) -> Page:
         Text(_REAL_ARM, show="details"),
     ]
     view = folder / "arm.html"
-    caption = "Release with the identified model (grey) and with the model of the SDF (green)"
+    caption = "Identified model in mode guide (grey), model of the SDF in mode gravity (green)"
     scene = [Scene(view.read_text, caption, start=float(result.time[0]))]
     identify = f"dvrk-drake identify {folder}/poses.csv --arm {arm.source} --output MODEL.yaml --report report.html"
     return Page(
         f"Demo: {arm.name}, simulated",
-        f"Verdict: the identified model {'holds' if held else 'does not hold'} the released {arm.name} for "
-        f"{duration:g} s. Largest drift: {largest['identified']}, limit 15 mrad. With the model of the SDF, the "
-        f"largest drift of the same arm is {largest['nominal']}.",
+        f"Verdict: in mode guide, the identified model {'holds' if held else 'does not hold'} the released {arm.name} "
+        f"for {duration:g} s. Largest drift: {largest['identified']}, limit 15 mrad. With the model of the SDF in mode "
+        f"gravity, the largest drift of the same arm is {largest['nominal']}.",
         [
             Section("Drift and torque errors", blocks),
             Section("Release", [*scene, _drift_plot(result)]),

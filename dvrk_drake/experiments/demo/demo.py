@@ -24,6 +24,7 @@ from dvrk_drake.models.effects_schema import ArmEffects, DriveEffect
 from dvrk_drake.models.typed_yaml import load_yaml, typed_content
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.systems.gravity_pid_controller import Mode
 
 #: Numbers of poses for identification and for validation. Settling time at a pose [s].
 POSES, FRESH_POSES, SETTLE = 24, 8, 0.5
@@ -156,11 +157,11 @@ def run_demo(
         fresh_poses = collect(FRESH_POSES, "collecting fresh poses")
         dvrk.write_recording(fresh_poses, output / "fresh_poses.csv", arm)
 
-        def release(model: dvrk.IdentifiedModel, start: float) -> Simulation:
+        def release(model: dvrk.IdentifiedModel, mode: Mode, start: float) -> Simulation:
             return dvrk.simulate(
                 simulated,
                 controller=model,
-                mode="gravity",
+                mode=mode,
                 release_time=RELEASE_TIME,
                 start=plan.release,
                 duration=RELEASE_TIME + DURATION,
@@ -168,7 +169,7 @@ def run_demo(
                 progress=lambda _, share: progress("simulating the release", start + share / 2),
             )
 
-        with_nominal, with_identified = release(nominal, 0.0), release(model, 0.5)
+        with_nominal, with_identified = release(nominal, "gravity", 0.0), release(model, "guide", 0.5)
     n = arm.num_joints
     fresh, fresh_nominal = (dvrk.validate(used, fresh_poses) for used in (model, nominal))
     return DemoResult(
