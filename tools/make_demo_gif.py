@@ -70,8 +70,8 @@ def write_gif(pictures: list[Image.Image], file: Path, period: float, colours: i
     strip = Image.new("RGB", (samples[0].width, samples[0].height * len(samples)))
     for i, sample in enumerate(samples):
         strip.paste(sample, (0, i * sample.height))
-    # The median cut would mix the green of the ghost, which covers a small area, with the grey of the arm.
-    palette = strip.quantize(colours, method=Image.Quantize.MAXCOVERAGE)
+    # k-means keeps the green of the ghost, which covers a small area, apart from the colours of the ground.
+    palette = strip.quantize(colours, method=Image.Quantize.MEDIANCUT, kmeans=3)
     first, *rest = (picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures)
     first.save(file, save_all=True, append_images=rest, duration=round(1000 * period), loop=0, optimize=True)
 
