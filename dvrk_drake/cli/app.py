@@ -107,12 +107,53 @@ def with_instrument(arm: str, instrument: str) -> str:
 
 
 Model = Annotated[str, Parameter(metavar="MODEL.yaml", help="Model file, written by identify.")]
+
+
+def gravity_vector(_: object, tokens: Sequence[Token]) -> tuple[float, float, float]:
+    """Converts the words after --gravity (a vector) or --mount (the orientation of the base) to a gravity vector."""
+    words, keywords = [token.value for token in tokens], {token.keyword or "" for token in tokens}
+    if len(keywords) > 1:
+        raise ValueError("--gravity and --mount exclude each other; give one of them")
+    is_file = keywords == {"--mount"} and len(words) == 1 and words[0].lower().endswith(".json")
+    try:
+        numbers = [_mounting_pitch(words[0])] if is_file else [float(word) for word in words]
+    except ValueError as error:
+        raise ValueError(str(error) if is_file else f"{min(keywords)}: {' '.join(words)!r} are not numbers") from None
+    if keywords == {"--mount"}:
+        from dvrk_drake.models.mounting import mount_gravity
+
+        if len(numbers) not in (1, 3) or not all(abs(x) <= 2 * math.pi for x in numbers):
+            raise ValueError("--mount needs roll, pitch and yaw, or mounting_pitch, within -6.28..6.28 rad, or a file")
+        return mount_gravity(*numbers)
+    if len(numbers) != 3:
+        raise ValueError("--gravity needs three numbers [m/s^2]")
+    return numbers[0], numbers[1], numbers[2]
+
+
+def _mounting_pitch(path: str) -> float:
+    """Returns `mounting_pitch` of a configuration of the dVRK. Raises ValueError if it cannot be read."""
+    from dvrk_drake.errors import DvrkDrakeError
+    from dvrk_drake.export.dvrk_psm_gravity_compensation import configured_pitch
+
+    try:
+        return configured_pitch(path)
+    except DvrkDrakeError as error:
+        raise ValueError(str(error)) from None
+
+
+GRAVITY_HELP = (
+    "Gravity vector in the base frame of the arm [m/s^2], for a tilted base. With --mount instead: roll, pitch and yaw "
+    "of the base [rad], mounting_pitch of the dVRK [rad], or the configuration of the arm in the dVRK (JSON)."
+)
 Gravity = Annotated[
     tuple[float, float, float] | None,
     Parameter(
         metavar="X Y Z",
-        help="Gravity vector in the base frame of the arm [m/s^2], e.g. for a tilted base. Default: the vector in "
-        "the arm file.",
+        alias="--mount",
+        converter=gravity_vector,
+        n_tokens=-1,
+        consume_multiple=True,
+        help=f"{GRAVITY_HELP} Default: the vector in the arm file.",
     ),
 ]
 Table = Annotated[

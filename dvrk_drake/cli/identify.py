@@ -9,6 +9,7 @@ from cyclopts import Parameter, Token
 
 import dvrk_drake as dvrk
 from dvrk_drake.cli.app import (
+    GRAVITY_HELP,
     IDENTIFY,
     Arm,
     FileOptions,
@@ -20,6 +21,7 @@ from dvrk_drake.cli.app import (
     Recording,
     Verbose,
     app,
+    gravity_vector,
     identify,
     one_of,
 )
@@ -41,27 +43,23 @@ if TYPE_CHECKING:
     from dvrk_drake.reports.page import Page
 
 
-def _gravity(_: object, tokens: Sequence[Token]) -> tuple[float, float, float] | Literal["estimate"]:
-    """Converts the words after --gravity. Raises ValueError unless they are three numbers or "estimate"."""
-    words = [token.value for token in tokens]
-    if words == ["estimate"]:
+def _gravity(argument: object, tokens: Sequence[Token]) -> tuple[float, float, float] | Literal["estimate"]:
+    """Converts the words after --gravity or --mount. Raises ValueError unless they are numbers or "estimate"."""
+    if [token.value for token in tokens] == ["estimate"]:
         return "estimate"
-    try:
-        x, y, z = map(float, words)
-    except ValueError:
-        raise ValueError("--gravity needs three numbers [m/s^2], or the word estimate") from None
-    return x, y, z
+    return gravity_vector(argument, tokens)
 
 
 OwnGravity = Annotated[
     tuple[float, float, float] | Literal["estimate"] | None,
     Parameter(
         metavar="X Y Z",
+        alias="--mount",
         converter=_gravity,
         n_tokens=-1,
         consume_multiple=True,
-        help="Gravity vector in the base frame of the arm [m/s^2], e.g. for a tilted base. The word estimate instead "
-        "of the numbers estimates the direction from the recording. Default: the vector in the arm file.",
+        help=f"{GRAVITY_HELP} The word estimate estimates the direction from the recording. Default: the vector in the "
+        "arm file.",
     ),
 ]
 Compare = Annotated[

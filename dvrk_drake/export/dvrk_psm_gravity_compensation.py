@@ -34,6 +34,7 @@ from dvrk_drake.errors import ModelError
 from dvrk_drake.export.gravity_compensation_loss import CompensationLoss, accepted_differences, make_loss
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import atomic_write, read_json_input
+from dvrk_drake.models.mounting import mount_gravity
 from dvrk_drake.models.plant import shared_plant
 
 ARM_JOINTS = ("yaw", "pitch", "insertion")
@@ -43,8 +44,6 @@ CHAIN_FROM_ARM = np.array([[1, 0, 0], [0, 0, 0], [0, 1, 0], [0, -1, 0], [0, 1, 0
 #: Matrix from the joint torques of the chain to those of yaw, pitch and insertion.
 ARM_FROM_CHAIN = np.array([[1, 0, 0, 0, 0, 0, 0], [0, 0, 1, -1, 1, 0, 0], [0, 0, 0, 0, 0, 0, 1]])
 PRISMATIC = np.array([False] * 5 + [True] * 2)
-#: Gravitational acceleration of the controller [m/s^2] (mtsIntuitiveResearchKitArm.cpp of sawIntuitiveResearchKit).
-CONTROLLER_GRAVITY = 9.81
 #: Sideways tilt [rad] above which it is named as the cause of a difference. It is below the last digit of a gravity
 #: vector that is given with six digits.
 _LEAST_TILT = 1e-6
@@ -127,7 +126,7 @@ def controller_gravity(pitch: float) -> NDArray[np.float64]:
     Si have a pitch of -45 degrees. Source: mtsIntuitiveResearchKitArm.cpp of sawIntuitiveResearchKit 2.4.0, which
     computes the opposite vector (0, sin(pitch), cos(pitch)) * 9.81.
     """
-    return -CONTROLLER_GRAVITY * np.array([0.0, np.sin(pitch), np.cos(pitch)])
+    return np.array(mount_gravity(pitch))
 
 
 def configuration_beside(path: str | Path) -> Path | None:

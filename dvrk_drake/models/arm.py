@@ -29,6 +29,7 @@ from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 from dvrk_drake.models.effects_schema import ArmEffects, per_actuator
 from dvrk_drake.models.immutable import cached, immutable
 from dvrk_drake.models.linear_map import LinearMap
+from dvrk_drake.models.mounting import mount_gravity
 from dvrk_drake.models.ranges import RANGE, Range, number_fault
 
 #: Maximum norm of the gravity vector [m/s^2].
@@ -283,6 +284,18 @@ class Arm:
             ArmError: `gravity` does not have three elements, or its norm exceeds 30 m/s^2.
         """
         return _mounted(self, tuple(checked_gravity(gravity).tolist()))
+
+    def with_mount(self, roll: float, pitch: float = 0.0, yaw: float = 0.0) -> Arm:
+        """Returns the same arm with the gravity of a base with this orientation in the world [rad].
+
+        `mounting_pitch` of the dVRK is the roll.
+
+        Example:
+            >>> import dvrk_drake as dvrk
+            >>> dvrk.load_arm("ecm_si").with_mount(-1.22173).gravity.round(2).tolist()  # 70 degrees down
+            [0.0, 9.22, -3.36]
+        """
+        return self.with_gravity(mount_gravity(roll, pitch, yaw))
 
     def with_position_offsets(self, offsets: Mapping[str, float]) -> Arm:
         """Returns the same arm with other joint zeros: model position = recorded position + offset.

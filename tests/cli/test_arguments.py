@@ -5,6 +5,7 @@ import json
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from command_output import refusal
 
@@ -198,3 +199,37 @@ def test_effort_scale_is_one_number_or_some_of_joints():
     for texts in (["x"], ["yaw=x"], ["yaw="], ["2", "3"]):
         with pytest.raises(RecordingError, match=r"^--effort-scale .*: allowed: .*, e\.g\. elbow=11\.8$"):
             FileOptions(effort_scale=texts).as_arguments()
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["--gravity", "0", "-9.81", "0"], [0, -9.81, 0]),
+        (["--mount", "-1.22173"], [0.0, 9.21846, -3.35520]),
+        (["--mount", "0", "-0.5", "2"], [-4.70314, 0.0, -8.60909]),
+        (["--mount", "arm.json"], [0.0, 9.81, 0.0]),
+    ],
+)
+def test_mounting_is_a_gravity_vector(words, expected, tmp_path, monkeypatch):
+    from dvrk_drake.cli.program import app as program
+
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "arm.json").write_text('{"mounting_pitch": -1.5707963267948966} // a configuration of the dVRK')
+    for command in (["equations", "--arm", "psm"], ["identify", "r.csv", "--arm", "psm", "--output", "m.yaml"]):
+        _, bound, _ = program.parse_args([*command, *words], print_error=False, exit_on_error=False)
+        np.testing.assert_allclose(bound.kwargs["gravity"], expected, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--mount", "45"], "--mount needs roll, pitch and yaw, or mounting_pitch, within -6.28..6.28 rad"),
+        (["--mount", "1", "2"], "--mount needs roll, pitch and yaw"),
+        (["--mount", "gone.json"], "gone.json"),
+        (["--gravity", "0", "1"], "--gravity needs three numbers"),
+        (["--gravity", "0", "1", "x"], "'0 1 x' are not numbers"),
+        (["--gravity", "0", "0", "-9.81", "--mount", "1"], "exclude each other"),
+    ],
+)
+def test_unusable_mountings_are_refused(words, message, capsys):
+    assert message in refused(capsys, "equations", "--arm", "psm", *words)
