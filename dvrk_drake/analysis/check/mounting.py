@@ -37,6 +37,9 @@ MIN_ANGLE = np.deg2rad(30.0)
 #: estimated joint zero and a multiple of 90 degrees at which the multiple is used [rad]. Robots are mounted at right
 #: angles, and the estimate contains the errors of the nominal masses.
 SNAP_ANGLE = np.deg2rad(10.0)
+#: Smallest difference of a joint zero that is used [rad], that of a quarter turn and its refinement. Smaller ones are
+#: only reported, because an inaccurate centre of mass in the model file has the same effect.
+MIN_USED_OFFSET = np.pi / 4
 #: Differences of the joint zeros of a model and of a controller [rad].
 QUARTER_TURNS = (np.pi / 2, -np.pi / 2, np.pi)
 #: Largest factor between measured and nominal gravity efforts that may be due to inaccurate masses. Currents in A are
@@ -83,7 +86,8 @@ def find_mounting(observations: Observations) -> tuple[Arm, list[Finding]]:
     if gain < max(MIN_CONFIRMED_GAIN, fit.gain(-np.eye(arm.num_joints)) if fit.moves else 0.0):
         return arm, scale
     is_used = is_assumed(arm)
-    return (found if is_used else arm), [*_findings(arm, gravity, offsets, is_used), *scale]
+    used = _arm_with(arm, gravity, np.where(np.abs(offsets) < MIN_USED_OFFSET, 0.0, offsets)) if is_used else arm
+    return used, [*_findings(arm, gravity, offsets, is_used), *scale]
 
 
 def _with_wide_limits(arm: Arm) -> Arm:
@@ -110,15 +114,18 @@ def _log_likelihood(observations: Observations, arm: Arm) -> float:
 
 
 def _findings(arm: Arm, gravity: NDArray[np.float64], offsets: NDArray[np.float64], is_used: bool) -> Iterator[Finding]:
-    used = "This is used" if is_used else "It is not used"
+    def use(applies: bool) -> str:
+        return "This is used" if applies else "It is not used"
+
     if not np.array_equal(gravity, arm.gravity):
         vector, stated = (" ".join(f"{x:.3g}" for x in g + 0.0) for g in (gravity, arm.gravity))
-        what = f"gravity acts along ({vector}) m/s^2 in the base frame, not along ({stated}). {used}"
+        what = f"gravity acts along ({vector}) m/s^2 in the base frame, not along ({stated}). {use(is_used)}"
         advice = f"State it with identify --gravity {vector}, or in the arm file."
         yield Finding("warning", "gravity direction", arm.name, what, advice)
     for j in np.flatnonzero(offsets):
         name, degrees = arm.joint_names[j], np.rad2deg(offsets[j])
-        what = f"the zero of q{j + 1} differs by {degrees:+.0f} degrees from that of the model. {used}"
+        what = f"the zero of q{j + 1} differs by {degrees:+.0f} degrees from that of the model. "
+        what += use(is_used and abs(offsets[j]) >= MIN_USED_OFFSET)
         advice = f"State it in the arm file: position_offsets: {{{name}: {offsets[j]:.4f}}}."
         yield Finding("warning", "joint zero", name, what, advice, (int(j),), float(offsets[j]))
 

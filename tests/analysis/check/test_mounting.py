@@ -8,7 +8,7 @@ from robot_file import write_robot
 from robot_motion import ROTORS, robot_motion
 
 import dvrk_drake as dvrk
-from dvrk_drake.analysis.check.mounting import find_mounting
+from dvrk_drake.analysis.check.mounting import MIN_USED_OFFSET, find_mounting
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.models.arm_files import derived_arm_file
 
@@ -63,7 +63,9 @@ def test_any_zero_that_gravity_shows_is_found(shared_data, offset):
     found, (finding,) = find_mounting(Observations(shifted, arm))
     assert (finding.kind, finding.joints) == ("joint zero", (2,))
     np.testing.assert_allclose(finding.size, -offset, rtol=0, atol=0.1)
-    assert found.position_offsets == {arm.joint_names[2]: finding.size}
+    is_used = offset > MIN_USED_OFFSET
+    assert found.position_offsets == ({arm.joint_names[2]: finding.size} if is_used else {})
+    assert ("This is used" if is_used else "It is not used") in finding.what
 
 
 def test_mounting_of_an_arm_file_is_not_replaced(path, tmp_path):
