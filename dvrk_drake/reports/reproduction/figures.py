@@ -215,7 +215,7 @@ def _largest(q: NDArray[np.float64], start: float = -10.0) -> NDArray[np.float64
 def _steps_plot(arm: Arm, faulty: NDArray[np.float64], ours: NDArray[np.float64]) -> Plot:
     """Returns the positions of all joints in the step to zero, beside them enlarged."""
     panels = []
-    runs = ((ours, "ours on the arm of Fig. 5"), (faulty, "the paper's controller on the paper's arm"))
+    runs = ((ours, "ours on the arm of Fig. 5"), (faulty, "paper's on the paper's arm"))
     for q, label in runs:
         t = PERIOD * np.arange(len(q))
         marks: list[Mark] = [
