@@ -196,6 +196,18 @@ def is_package_arm(arm: Arm | str) -> bool:
     return name.upper() in map(str.upper, known_arms())
 
 
+def package_arms(arm: Arm) -> list[Arm]:
+    """Returns the arms of this package with the name of an arm, with its instrument if it is known.
+
+    The name may end with a number, as PSM1.
+    """
+    name = "".join(filter(str.isalnum, arm.name)).rstrip("0123456789").upper()
+    same = [known for known in map(load_arm, known_arms()) if known.name.upper() == name]
+    if arm.instrument not in dvrk_tools():
+        return same
+    return [load_arm(known.source, arm.instrument) if known.instrument else known for known in same]
+
+
 @cached
 def _load_arm(name: str, state: tuple[int, int] = (0, 0)) -> Arm:
     """Loads an arm by name or absolute path. `state` (time of change, size) is the version of the YAML file."""

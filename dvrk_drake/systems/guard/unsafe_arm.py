@@ -9,7 +9,7 @@ import numpy as np
 
 from dvrk_drake.dynamics.identified_model import ControlModel, IdentifiedModel
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.arm_files import is_package_arm, load_arm
+from dvrk_drake.models.arm_files import package_arms
 from dvrk_drake.models.plant import link_poses
 
 #: Accepted differences between an arm and the arm of this package with the same name, in `unsafe_difference`.
@@ -40,14 +40,14 @@ _NUM_POSES = 20
 def unsafe_difference(arm: Arm) -> str:
     """Returns a message on the first dangerous difference from the arm of this package with the same name, or "".
 
-    A guard with these limits, gains, couplings or links would not protect that arm. The name may end with a number, as
-    PSM1. An arm with another name is not compared.
+    A guard with these limits, gains, couplings or links would not protect that arm. If several arms have this name (two
+    generations), one without a dangerous difference suffices. An arm with another name is not compared.
     """
-    name = "".join(filter(str.isalnum, arm.name)).rstrip("0123456789").lower()
-    if not is_package_arm(name):
+    known = package_arms(arm)
+    if any(arm is each for each in known):
         return ""
-    known = load_arm(name)
-    return next(filter(None, _unsafe_differences(arm, known)), "") if arm is not known else ""
+    differences = [next(filter(None, _unsafe_differences(arm, each)), "") for each in known]
+    return differences[0] if differences and all(differences) else ""
 
 
 def _unsafe_differences(arm: Arm, known: Arm) -> Iterator[str]:

@@ -174,6 +174,6 @@ def test_usual_differences_are_accepted(changes, tmp_path):
     assert unsafe_difference(mtml(tmp_path, **changes)) == ""
 
 
-@pytest.mark.parametrize("name", known_arms())
+@pytest.mark.parametrize("name", [*known_arms(), "psm+PROGRASP_FORCEPS_400093", "psm_si+NEEDLE_DRIVER_420117"])
 def test_arms_of_the_package_are_accepted(name):
     assert unsafe_difference(load_arm(name)) == ""
