@@ -94,7 +94,7 @@ def teach(
             count = connection.teach(poses, at_rest=at_rest)
     finally:
         line.clear()
-    print_written(poses, f"{count} poses; the guard of {connection.arm.name} regulates the pose")
+    print_written(poses, f"{count} poses; the arm holds its pose")
     suggest(f"dvrk-drake collect poses {poses} {controlled.as_text()} --output {Path(poses).with_suffix('.csv')}")
 
 

@@ -97,7 +97,7 @@ def control(
             connection.run(mode, gains=checked_gains, friction=compensator, report=show)
     finally:
         line.clear()
-    print(f"control ended; the guard of {name} regulates the pose", flush=True)
+    print_line(f"control ended; {name} holds its pose")
 
 
 @app.command(group=HARDWARE)

@@ -259,7 +259,7 @@ def test_run_starts_ramps_and_ends_in_hold(arm, mode):
     held = observer.received[observer.until(is_holding, "hold", begun)]
     assert held.num_expired == expired  # it received HOLD and no command expired
     assert drift(*observer.during(0.1)) < 1e-3
-    assert "regulates the pose" in said
+    assert "holds its pose" in said
     assert "effort; " in said and " Hz, round trip " in said
     print(f"{name} {mode}: {said.splitlines()[-2].strip()}")
 

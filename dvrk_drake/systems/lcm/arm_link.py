@@ -145,10 +145,10 @@ class MessageLink(ArmLink):
         self._last, self._is_new = status, True
 
     def _ignored_text(self) -> str:
-        """Returns a description of the statuses that were ignored since the last accepted status, or ""."""
+        """Returns a description of the statuses that were ignored since the last accepted status, or advice."""
         ignored = self._filter.ignored.most_common()
         if not ignored:
-            return ""
+            return ". Check that the process or the bridge of the arm runs on this network"
         advice = {
             StatusFilter.OTHER_SESSION: f"; {self.arm.name} was restarted: look at it, then start again",
             StatusFilter.NOT_AUTHENTIC: "; the arm and this process need the same key (--key)",
