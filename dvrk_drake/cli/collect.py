@@ -14,6 +14,7 @@ from dvrk_drake.cli.control import connect_arm
 from dvrk_drake.cli.support import (
     check_output,
     interrupt_ends_process,
+    print_line,
     print_notes,
     print_written,
     suggest,
@@ -147,7 +148,9 @@ def collect_poses(
         if connection.dialog.stopped():
             raise KeyboardInterrupt
         return
-    print(f"{output}: {collector.done.sum()} of {len(collector.done)} poses; the arm holds its pose", flush=True)
+    # Over ROS 2, a missing confirmation of `hold` was reported.
+    holds = "" if controlled.is_ros else "; the arm holds its pose"
+    print_line(f"{output}: {collector.done.sum()} of {len(collector.done)} poses{holds}")
     if collector.problem is not None:
         raise collector.problem
     if connection.dialog.stopped():

@@ -32,7 +32,7 @@ _RELEASE = 1.0
 _TIMEOUT = 10.0
 
 #: Advice for an arm that has a fault or waits for an operator.
-_RESET = "Look at the arm, then start again with --reset"
+_RESET = "Look at the arm, then start again, over LCM with --reset"
 
 #: Period in which `report` is called with the live status [s].
 _REPORT_PERIOD = 0.2

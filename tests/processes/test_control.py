@@ -89,7 +89,7 @@ def test_failing_second_controller_does_not_disturb_the_first(controller, monkey
     assert (link.guard.state, link.guard.sender_id) == (Status.STATE_EFFORT, other.sender_id)
 
 
-LOOK = r"Look at the arm, then start again with --reset"
+LOOK = r"Look at the arm, then start again, over LCM with --reset"
 
 
 @pytest.mark.parametrize("seconds", [0.02, 0.05, 0.2, 1.0])

@@ -226,7 +226,7 @@ def test_run_ends_after_stall_and_operator_restarts(stalled):
             lines = [line for line in ended.output().splitlines() if line.startswith("dvrk-drake: error")]
             (line,) = lines
             assert line.startswith("dvrk-drake: error: the guard of MTML holds the arm: ")
-            assert line.endswith("Look at the arm, then start again with --reset")
+            assert line.endswith("Look at the arm, then start again, over LCM with --reset")
         assert all(map(waits_for_an_operator, observer.received[held:]))
         runs.append(start_run("mtml", *url, "--reset"))
         observer.until(lambda status: is_holding(status) and not status.fault_text, "resume", held, runs[-1])
@@ -285,7 +285,7 @@ def test_run_stops_on_fault_and_refuses_faulty_arm():
     assert "MTML has a fault: the amplifier is hot" in next(run)
     again = ends()
     next(again)
-    assert "Look at the arm, then start again with --reset" in next(again)
+    assert "Look at the arm, then start again, over LCM with --reset" in next(again)
     arm.commands.clear()
     meant = start_run("mtml", "--reset", "--realtime", "--lcm-url", OTHER_URL)
     try:
