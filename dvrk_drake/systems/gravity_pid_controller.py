@@ -17,22 +17,30 @@ from dvrk_drake.dynamics.slip_effort import MAX_SLIP_SHARE, slip_effort
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.models.arm_schema import Gains
 from dvrk_drake.systems.gravity_pid_step import controller_step
-from dvrk_drake.systems.virtual_friction import NUM_STATES
+from dvrk_drake.systems.virtual_friction import FILTER_TIME, NUM_STATES, RATE_TIME
 
 #: "hold" regulates a pose, "gravity" compensates gravity and leaves the arm free to move, "damped" adds damping, and
 #: "guide" adds virtual dry friction, so the arm stays where a hand leaves it.
 Mode = Literal["hold", "gravity", "damped", "guide"]
 
-#: Distance within which a joint is at rest [rad], [m], in addition to 1.5 encoder counts. A hand that rests moves a
-#: joint less within `virtual_friction.REST_TIME`. A hand that turns back moves it further.
-_REST = 0.001, 0.0001
+#: Largest speed of the slow motion of a joint at rest [rad/s], [m/s]. A hand that rests drifts by a few mrad/s, and an
+#: arm that it releases too early sinks slowly.
+_REST_SPEED = 0.02, 0.002
 
-#: Deflection within which a hand breaks a spring of mode "guide" away [rad], [m], if the next two numbers allow it.
-_BREAK_AWAY = 0.02, 0.002
+#: Share of one encoder count that the difference of the two filters of `virtual_friction` reaches after one count: 1/e.
+_COUNT_RESPONSE = 0.37
 
-#: Largest change of effort by one encoder count, as a share of the slip effort. The springs of mode "guide" are not
-#: stiffer than that, because the joint would oscillate about the edge of a count.
-_COUNT_SHARE = 0.1
+#: Distance from its place at which a spring of mode "guide" breaks away [rad], [m], in addition to 1.5 encoder counts.
+#: The tremor and the drift of a hand at rest, and a slip after the release, are smaller.
+_TRAVEL = 0.008, 0.0008
+
+#: Deflection at which a spring of mode "guide" slides [rad], [m], if the next two numbers allow it. A released arm
+#: should move by at most 5 mrad.
+_DEFLECTION = 0.004, 0.0004
+
+#: Largest effort of a spring or of the damping because of one encoder count, as a share of the slip effort. With larger
+#: efforts, a joint oscillates about the edge of a count.
+_COUNT_SHARE = 0.2
 
 #: Largest ratio of the stiffness of a spring of mode "guide" to the gain Kp. It doubles the bandwidth, so the phase
 #: margin at the delays of the velocity filter and of the messages remains large enough.
@@ -57,13 +65,14 @@ class GravityPidController(LeafSystem):
     slow motion that does not accelerate.
 
     **Guide.** In "guide" mode, virtual dry friction is added to G(q), so the arm stays where a hand leaves it, although
-    G(q) has an error and the friction of the arm relaxes. When a joint has rested for 0.25 s, a spring attaches at its
-    position, without a step of the effort. Its stiffness is Kp, or up to four times as large if it would otherwise
-    deflect by more than 20 mrad. The spring holds the joint up to its slip effort. A larger effort of a hand breaks it
-    away, and the joint is free until it rests again. Each spring is passive: it returns at most the energy with which
-    the hand deflected it, and dissipates this energy when it breaks away. Damping acts in addition. On a free joint, it
-    acts only below about 12 mrad/s, up to the error of the model. All springs detach if a measurement is not valid, if
-    the position jumps, and in all other modes. Their efforts then decay with a time constant of 20 ms.
+    G(q) has an error and the friction of the arm relaxes. When a joint has moved slower than 20 mrad/s for about 0.3 s,
+    apart from the tremor of a hand, a spring attaches at its position, without a step of the effort. Its stiffness is
+    Kp, or up to four times as large if it would otherwise deflect by more than 4 mrad. The spring holds the joint up to
+    its slip effort, at which it slides. It breaks away 8 mrad from its place, or when a hand moves two joints faster
+    than 50 mrad/s, and the joint is free until it rests again. Each spring is passive: it returns at most the energy
+    with which the hand deflected it. Damping acts in addition. On a free joint, it acts only below 20 mrad/s, up to the
+    error of the model. All springs detach if a measurement is not valid, if the position jumps, and in all other modes.
+    Their efforts then decay with a time constant of 20 ms.
 
     .. pydrake_system::
 
@@ -182,13 +191,14 @@ class GravityPidController(LeafSystem):
         self.DeclareStateOutputPort(name="gravity_effort", state_index=gravity_effort)
         self.DeclareStateOutputPort(name="fault", state_index=fault)
         counts = arm.encoder_counts()
-        tolerances = arm.per_joint(*_REST) + 1.5 * counts, arm.per_joint(*_JUMP) + 3.0 * counts
-        self._deflection = np.maximum(arm.per_joint(*_BREAK_AWAY), counts / _COUNT_SHARE)
-        self._constants = np.array([model.feedforward_scale, limits, *tolerances])
+        rest = FILTER_TIME * arm.per_joint(*_REST_SPEED) + _COUNT_RESPONSE * counts
+        travel = arm.per_joint(*_TRAVEL) + 1.5 * counts
+        jump = arm.per_joint(*_JUMP) + 3.0 * counts
+        self._constants = np.array([model.feedforward_scale, limits, rest, travel, jump])
         # Reading one cache entry at each update is faster than reading each parameter.
         self._settings = self.DeclareCacheEntry(
             "settings",
-            ValueProducer(allocate=lambda: AbstractValue.Make((np.zeros((11, n)), 0)), calc=self._calc_settings),
+            ValueProducer(allocate=lambda: AbstractValue.Make((np.zeros((12, n)), 0)), calc=self._calc_settings),
             {self.all_parameters_ticket()},
         )
         holding = model.static_model.with_parameters(model.theta)
@@ -249,9 +259,12 @@ class GravityPidController(LeafSystem):
 
         Without the dry friction, the slip effort is the error of the model, which lets a free joint drift.
         """
-        stiffness = np.clip(slip / self._deflection, kp, _MAX_STIFFENING * kp)
-        ratio = np.divide(stiffness, kp, out=np.ones_like(kp), where=kp > 0)
-        return stiffness, np.sqrt(ratio) * kd, np.maximum(slip - self._arm.dry_friction(), 0.0)
+        counts = np.maximum(self._arm.encoder_counts(), np.finfo(float).tiny)
+        deflection = self._arm.per_joint(*_DEFLECTION)
+        stiffness = np.clip(slip / np.maximum(deflection, counts / _COUNT_SHARE), kp, _MAX_STIFFENING * kp)
+        damping = np.sqrt(np.divide(stiffness, kp, out=np.ones_like(kp), where=kp > 0)) * kd
+        damping = np.minimum(damping, _COUNT_SHARE * slip * RATE_TIME / counts)
+        return stiffness, damping, np.maximum(slip - self._arm.dry_friction(), 0.0)
 
     def _make_update(self, holding: HoldingArrays, restart: bool) -> Callable[[Context, DiscreteValues], None]:
         """Returns the handler of an update event.

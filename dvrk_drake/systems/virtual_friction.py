@@ -6,71 +6,94 @@ import numpy as np
 
 from dvrk_drake.dynamics.compiled import compiled
 
-#: Time [s] for which a joint must rest before its spring attaches. A hand that moves a joint slowly or turns back does
-#: not rest that long. A spring that attached behind the hand would pull the joint back after the release.
-REST_TIME = 0.25
+#: Time constant [s] of the two low-pass filters in series that find the slow motion of a joint. They attenuate the
+#: tremor of a hand (8 to 12 Hz) by a factor of 17 to 37. Their delay adds to `REST_TIME`.
+FILTER_TIME = 0.08
 
-#: Time constant [s] with which the effort of a detached spring decays. The effort has no step, and is gone before the
+#: Time [s] for which the slow motion must be at rest before a spring attaches. A hand that turns back does not rest
+#: that long. A spring that attached behind the hand would pull the joint back after the release.
+REST_TIME = 0.15
+
+#: Ratio of the speed of a joint that a hand moves to the largest speed of a joint at rest, and smallest number of such
+#: joints in an arm that a hand moves. All springs are detached while a hand moves the arm, because a joint whose speed
+#: passes through zero is not at rest. One joint alone may also slide because of a large error of the model.
+MOVING_RATIO, MIN_MOVING = 2.5, 2
+
+#: Time constant [s] with which the strength of a detached spring decays. The effort has no step, and is gone before the
 #: spring can attach again.
 DECAY_TIME = 0.02
 
-#: Ratio of the speed at which the damping of a free joint ends to the largest speed of a joint at rest. The damping
-#: stops a joint that begins to drift because of an error of the model. At larger speeds, a hand would feel it.
-FADE_RATIO = 3.0
+#: Time constant [s] with which the place of an attached spring follows a joint that slides slowly. A hand that rests
+#: drifts by a few mrad/s and must not break the springs away.
+PLACE_TIME = 1.0
 
-#: Number of state variables per joint: position at which the spring is attached (NaN: detached), effort of the spring,
-#: reference position of the rest (NaN: unknown), and time since the joint left it.
-NUM_STATES = 4
+#: Time constant [s] of the velocity for the damping, as that of the velocity that a dVRK measures (30 Hz).
+RATE_TIME = 0.005
+
+#: Number of state variables per joint: effort of the spring, its strength (share of the slip effort), place at which it
+#: attached (NaN: detached), the two filtered positions (NaN: unknown), time at rest, and velocity.
+NUM_STATES = 7
 
 
 @compiled
 def virtual_friction(
-    q, v, last_q, acts, period, kp, kd, slip, drift, tolerance, jump, memory, effort
+    q, v, last_q, acts, period, kd, slip, stiffness, drift, rest, travel, jump, memory, effort
 ):  # pragma: no cover - compiled
     """Advances the virtual friction of n joints by one period and subtracts its effort from `effort`.
 
-    The element of a joint is passive. Its spring stores energy only while the motion deflects it. A spring that breaks
-    away or detaches dissipates its energy: it decays, and the way back of the joint shortens it in addition.
+    The element of a joint is elasto-plastic, as dry friction: a spring that slides at its strength. The strength is the
+    slip effort at rest, and decays to zero after the joint has moved away. The element is passive. Its spring stores
+    only energy of the motion that deflects it. Sliding and a decaying strength only reduce the stored energy.
 
     Args:
         q, v: Position and velocity (n,) of the joints.
         last_q: Positions (n,) one period ago; NaN if unknown.
         acts: False if all springs are detached. The rest of the joints is nevertheless observed.
         period: Period [s].
-        kp, kd: Stiffness and damping (n,) of the springs.
-        slip: Efforts (n,) at which the springs break away. They also limit the damping of the attached joints.
+        kd: Damping (n,) of an attached joint, at most the slip effort.
+        slip: Efforts (n,) at which the springs slide.
+        stiffness: Stiffness (n,) of the springs.
         drift: Largest efforts (n,) of the damping of the free joints.
-        tolerance: Distances (n,) within which a joint is at rest.
+        rest: Distances (n,) by which the slow motion of a joint at rest may differ from its second filter.
+        travel: Distances (n,) from the place of the spring at which it breaks away.
         jump: Distances (n,) that no joint moves in one period.
-        memory: State (4 n,), see `NUM_STATES`.
+        memory: State (7 n,), see `NUM_STATES`.
         effort: Efforts (n,).
     """
     n = q.size
+    spring, strength, place = memory[:n], memory[n : 2 * n], memory[2 * n : 3 * n]
+    first, second, rested = memory[3 * n : 4 * n], memory[4 * n : 5 * n], memory[5 * n : 6 * n]
+    rate, num_moving = memory[6 * n :], 0
+    gain, rate_gain = period / (FILTER_TIME + period), period / (RATE_TIME + period)
     for i in range(n):
         step = q[i] - last_q[i]
-        if not abs(step) <= jump[i] + 2.0 * period * abs(v[i]):  # also for NaN
-            memory[i] = memory[2 * n + i] = np.nan
-        if not abs(q[i] - memory[2 * n + i]) <= tolerance[i]:
-            memory[2 * n + i], memory[3 * n + i] = q[i], 0.0
-        else:
-            memory[3 * n + i] += period
+        if np.isnan(first[i]) or not abs(step) <= jump[i] + 2.0 * period * abs(v[i]):  # also for NaN
+            step, first[i], second[i] = 0.0, q[i], q[i]
+            place[i], rested[i], rate[i] = np.nan, 0.0, 0.0
+        spring[i] += stiffness[i] * step
+        rate[i] += rate_gain * (step / period - rate[i])
+        first[i] += gain * (q[i] - first[i])
+        second[i] += gain * (first[i] - second[i])
+        rested[i] = rested[i] + period if abs(first[i] - second[i]) <= rest[i] else 0.0
+        num_moving += abs(first[i] - second[i]) > MOVING_RATIO * rest[i]
+    for i in range(n):
+        if np.isnan(place[i]) and rested[i] >= REST_TIME:
+            place[i] = first[i]
+        if abs(q[i] - place[i]) > travel[i] or num_moving >= MIN_MOVING:
+            place[i], rested[i] = np.nan, 0.0
         if not acts:
-            memory[i] = np.nan
-        deflected = kp[i] * (q[i] - memory[i])
-        if abs(deflected) <= slip[i]:
-            memory[n + i] = deflected
-        else:  # also if the spring is detached
-            if not np.isnan(memory[i]):
-                memory[i], memory[2 * n + i], memory[3 * n + i] = np.nan, q[i], 0.0
-            _decay(i, n, period, kp[i] * step, memory)
-            if acts and memory[3 * n + i] >= REST_TIME and kp[i] > 0.0:
-                memory[i] = q[i] - memory[n + i] / kp[i]
-        effort[i] -= memory[n + i]
+            place[i] = np.nan
+        most = drift[i] * max(1.0 - abs(rate[i]) * FILTER_TIME / rest[i], 0.0)
+        if np.isnan(place[i]):
+            strength[i] *= 1.0 - min(period / DECAY_TIME, 1.0)
+        else:
+            place[i] += period / PLACE_TIME * (second[i] - place[i])
+            strength[i], most = 1.0, slip[i]
+        limit = strength[i] * slip[i]
+        spring[i] = min(max(spring[i], -limit), limit)
+        effort[i] -= spring[i]
         if acts:
-            most = slip[i]
-            if np.isnan(memory[i]):
-                most = drift[i] * max(1.0 - abs(v[i]) * REST_TIME / (FADE_RATIO * tolerance[i]), 0.0)
-            effort[i] -= min(max(kd[i] * v[i], -most), most)
+            effort[i] -= min(max(kd[i] * rate[i], -most), most)
 
 
 @compiled
@@ -78,15 +101,7 @@ def detach(period, memory, effort):  # pragma: no cover - compiled
     """Detaches all springs and subtracts their decaying efforts from `effort` (n,). See `virtual_friction`."""
     n = effort.size
     for i in range(n):
-        memory[i], memory[2 * n + i], memory[3 * n + i] = np.nan, np.nan, 0.0
-        _decay(i, n, period, 0.0, memory)
-        effort[i] -= memory[n + i]
-
-
-@compiled
-def _decay(i, n, period, change, memory):  # pragma: no cover - compiled
-    """Reduces the effort of detached spring i, also by a `change` of its deflection effort towards zero."""
-    spring = memory[n + i] * (1.0 - min(period / DECAY_TIME, 1.0))
-    if spring * change < 0.0:
-        spring = np.sign(spring) * max(abs(spring) - abs(change), 0.0)
-    memory[n + i] = spring
+        memory[2 * n + i] = memory[3 * n + i] = np.nan
+        for k in (i, n + i):
+            memory[k] *= 1.0 - min(period / DECAY_TIME, 1.0)
+        effort[i] -= memory[i]

@@ -184,6 +184,29 @@ def test_control_applies_efforts_reports_and_releases(controller):
     assert link.guard.state == Status.STATE_HOLD and link.commands[-1].control_mode == Command.HOLD
 
 
+def test_springs_of_guide_detach_during_a_watchdog_hold():
+    # Over LCM and ROS 2, the same controller answers the statuses.
+    link, guide = GuardedArm(), ArmController(ARM, IdentifiedModel.from_arm(ARM), "guide", 1e-3)
+    modes, efforts = [], []
+    for k in range(1200):
+        if k == 1000:
+            pause_controller(link, 0.2)  # the commands expire
+        link.status.position = list(np.array(link.status.position) + (5e-6 if 700 < k < 900 else 0.0))
+        link.send(guide.answer(link.next_status(1.0), link.now()))
+        modes.append(guide._controller.GetMode(guide._controller_context))
+        efforts.append(link.commands[-1].effort)
+    assert modes[999] == "guide" and modes[1001] == "gravity"
+    assert np.abs(np.array(efforts[999]) - efforts[650]).max() > 1e-3  # the springs are deflected
+    np.testing.assert_allclose(efforts[1001], link.status.effort_measured, atol=1e-12)
+
+
+def test_guide_warns_about_a_model_without_validation(monkeypatch, capsys):
+    connection = SimpleNamespace(model=IdentifiedModel.from_arm(ARM), arm=ARM, run=lambda *args, **options: None)
+    monkeypatch.setattr("dvrk_drake.cli.lcm.connect_arm", lambda controlled, dialog: connection)
+    assert main(["control", "--arm", "mtml", "--mode", "guide"]) == 0
+    assert capsys.readouterr().err.count("warning: the error of the model at rest is unknown") == 1
+
+
 def test_live_status_describes_new_refusals():
     first, status = Status(), Status()
     first.num_refused, status.num_refused, status.refusal_code = 3, 5, Status.REFUSAL_START_FAR
