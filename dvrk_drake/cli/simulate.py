@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 import dvrk_drake as dvrk
-from dvrk_drake.cli.app import Arm, FileOptions, Set, one_of, simulate, whole_number
+from dvrk_drake.cli.app import Arm, FileOptions, Instrument, Set, one_of, simulate, whole_number, with_instrument
 from dvrk_drake.cli.report import Results
 from dvrk_drake.cli.support import Steps, check_output, command_again, until_stopped
 from dvrk_drake.errors import ScenarioError, StudyError
@@ -31,6 +31,7 @@ def simulate_scenario(
         Arm | None,
         Parameter(group=_SCENARIO, help="Regulate this arm at its home position."),
     ] = None,
+    instrument: Instrument = "",
     set: Set = None,
     output: Annotated[str | None, Parameter(metavar="RECORDING")] = None,
     meshcat: Annotated[bool, Parameter(show_default=False)] = False,
@@ -48,6 +49,11 @@ def simulate_scenario(
 
     if scenario in known_arms():
         raise ScenarioError(f"{scenario} is an arm, not a scenario; use --arm {scenario}")
+    if instrument and arm is None:
+        raise ScenarioError(
+            "--instrument requires --arm; a scenario states it as e.g. arm: psm+PROGRASP_FORCEPS_400093"
+        )
+    arm = with_instrument(arm, instrument) if arm else None
     source = arm or scenario or ""
     loaded = dvrk.load_scenario(source, set or [])
     results.check(source, loaded.controller.model, output=output)
