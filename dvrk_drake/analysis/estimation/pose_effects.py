@@ -47,6 +47,9 @@ MIN_SIGNIFICANCE = 1.5
 #: Smallest range of a coordinate for adding a cable or a spring [rad]. Within a smaller range, a sine or a spring would
 #: fit the position errors of the arm's controller, and a cosine would be almost equal to an offset.
 MIN_RANGE = {"cable sine": 0.25, "cable cosine": 1.5, "spring": 0.25}
+#: Smallest range of a joint for adding a second harmonic of its position [rad]: one period. Within a smaller range, the
+#: second harmonic is almost a combination of an offset and the first one.
+MIN_SECOND_RANGE = np.pi
 
 
 class StaticProblem:
@@ -96,7 +99,7 @@ class StaticProblem:
 
 
 def candidate_effects(problem: StaticProblem) -> list[list[ActuatorEffect]]:
-    """Returns the candidate effects in groups: offset and cables of one joint, or the spring of one actuator.
+    """Returns the candidate effects in groups, for each joint: offset and cables, second harmonic, spring of its actuator.
 
     All candidates are identifiable from the poses. A spring is a candidate if the arm file lists it for the actuator
     (`motion.known_effects`). Other effects at actuators are not candidates, because they increase the error on MTM
@@ -108,6 +111,7 @@ def candidate_effects(problem: StaticProblem) -> list[list[ActuatorEffect]]:
         effects = [ActuatorEffect(name, "offset"), *_cables(problem, name)]
         groups += [
             [e for e in effects if not _is_equal_to_gravity(problem.base_model, e)],
+            _second_harmonic(problem, name),
             _known_spring(problem, joint),
         ]
     return groups
@@ -127,6 +131,14 @@ def _cables(problem: StaticProblem, coordinate: str) -> list[ActuatorEffect]:
     span = np.ptp(position_along(problem.arm, coordinate, problem.q))
     kinds = ("cable sine", "cable cosine")
     return [ActuatorEffect(coordinate, kind, 1.0) for kind in kinds if span >= MIN_RANGE[kind]]
+
+
+def _second_harmonic(problem: StaticProblem, coordinate: str) -> list[ActuatorEffect]:
+    if is_prismatic(problem.arm, coordinate):
+        return []
+    if np.ptp(position_along(problem.arm, coordinate, problem.q)) < MIN_SECOND_RANGE:
+        return []
+    return [ActuatorEffect(coordinate, kind, 2.0) for kind in ("cable sine", "cable cosine")]
 
 
 def select_effects(problem: StaticProblem) -> tuple[ActuatorEffect, ...]:
