@@ -99,7 +99,7 @@ class StaticProblem:
 
 
 def candidate_effects(problem: StaticProblem) -> list[list[ActuatorEffect]]:
-    """Returns the candidate effects in groups, for each joint: offset and cables, second harmonic, spring of its actuator.
+    """Returns groups of candidate effects, for each joint: offset and cables, second harmonic, spring of its actuator.
 
     All candidates are identifiable from the poses. A spring is a candidate if the arm file lists it for the actuator
     (`motion.known_effects`). Other effects at actuators are not candidates, because they increase the error on MTM
