@@ -30,7 +30,7 @@ from dvrk_drake.dynamics.holding_torque import holding_torque_into
 from dvrk_drake.dynamics.static_model import StaticModel, static_model
 from dvrk_drake.errors import ArmError, ModelError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.arm_files import load_arm
+from dvrk_drake.models.arm_files import known_arms, load_arm
 from dvrk_drake.models.arm_schema import GRAVITIES
 from dvrk_drake.models.effect_kinds import POSITION_KINDS
 from dvrk_drake.models.effects_schema import FREEDOMS, DriveEffect, half_width
@@ -449,10 +449,20 @@ class ControlModel:
 
 
 def _arm_reference(path: str | Path, arm: Arm) -> str:
-    """Returns the reference to the arm in the model file at `path`: a URL, or a path relative to this file."""
+    """Returns the reference to the arm in the model file at `path`: a URL, or a path relative to this file.
+
+    For an arm of this package with another instrument, it is the source of the arm.
+    """
+    if _has_exchanged_instrument(arm.source):
+        return arm.source
     if not os.path.isabs(arm.source):
         return f"{PACKAGE_URL}arms/{arm.source}.yaml"
     return os.path.relpath(arm.source, os.path.dirname(os.path.realpath(path)))
+
+
+def _has_exchanged_instrument(source: str) -> bool:
+    arm, plus, _ = source.partition("+")
+    return bool(plus) and arm in known_arms()
 
 
 def _other_joints(own: Arm, arm: Arm) -> str:
@@ -468,6 +478,8 @@ def _other_joints(own: Arm, arm: Arm) -> str:
 def _arm_argument(path: str | Path, name: str) -> str:
     """Returns the argument of `load_arm` for the arm that has the reference `name` in the model file at `path`."""
     if not name.lower().endswith((".yaml", ".yml", *MODEL_SUFFIXES)) or name.startswith(PACKAGE_URL):
+        return name
+    if _has_exchanged_instrument(name):
         return name
     return os.path.join(os.path.dirname(os.path.realpath(path)), name)
 

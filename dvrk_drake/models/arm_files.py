@@ -82,7 +82,9 @@ def load_arm(name: str | Path, instrument: str | Path = "") -> Arm:
     if plus and own.lower() in known_arms():
         name, instrument = own, instrument or other
     if instrument:
-        return _load_arm(f"{load_arm(name).source}+{_instrument_name(instrument)}")
+        if name.lower() not in known_arms():
+            raise ArmError(f"{name}: state the instrument in the arm file (instrument: {os.fspath(instrument)})")
+        return _load_arm(f"{name.lower()}+{_instrument_name(instrument)}")
     if not name.lower().endswith((".yaml", ".yml", *MODEL_SUFFIXES)):
         if name.lower() not in known_arms() and os.path.isfile(name):
             raise ArmError(f"{name} is not the file of an arm; {_accepted()}")

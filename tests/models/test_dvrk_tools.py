@@ -61,12 +61,14 @@ def test_frames_limits_and_coupling_equal_the_file(name, carrier, tools):
             np.testing.assert_allclose(frame.CalcPoseInWorld(context).GetAsMatrix4(), X, atol=1e-12)
 
 
-def test_file_of_the_dvrk_gives_the_arm_of_the_table(tools):
+def test_file_of_the_dvrk_gives_the_arm_of_the_table(tools, tmp_path):
     by_file, by_name = (
         load_arm("psm", tools / "PROGRASP_FORCEPS_400093.json"),
         load_arm("psm", "prograsp_forceps_400093"),
     )
     assert by_name.source == "psm+PROGRASP_FORCEPS_400093"
+    IdentifiedModel.from_arm(by_file).save(tmp_path / "model.yaml")
+    assert IdentifiedModel.load(tmp_path / "model.yaml").arm is by_file
     assert load_arm(by_file.source) is by_file and load_arm(by_name.source) is by_name
     np.testing.assert_allclose(by_file.transmission.matrix, by_name.transmission.matrix, atol=0)
     assert shared_plant(by_file).CalcTotalMass(shared_plant(by_file).CreateDefaultContext()) == pytest.approx(
@@ -99,6 +101,7 @@ def test_recording_stores_the_instrument(tmp_path):
         ("ecm", "CADIERE_FORCEPS_400049", "ecm: the arm carries no instrument"),
         ("psm", "CADIERE_FORCEPS_40004", 'unknown instrument "CADIERE_FORCEPS_40004"; did you mean "CADIERE'),
         ("psm", "gone.json", "gone.json"),
+        ("my.yaml", "CADIERE_FORCEPS_400049", "my.yaml: state the instrument in the arm file"),
     ],
 )
 def test_unusable_instruments_are_refused(arm, instrument, message):
