@@ -137,8 +137,8 @@ class MomentumObserver:
         """Returns the `significance` that an arm without contact exceeds at the given rate.
 
         It is a quantile of the chi-squared distribution with n degrees of freedom. The low-pass makes w / 2 values per
-        second independent. The errors of a model are not exactly normal, so benchmarks/external_force.py measures the
-        rate.
+        second independent. The errors of a model are not normal, so the rate is exceeded by far with the covariance of
+        the same day, and must not be used with it (benchmarks/external_force.py).
 
         Args:
             false_alarms_per_hour: Expected number of false alarms per hour, from 1e-6 to 1000.
