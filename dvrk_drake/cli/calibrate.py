@@ -94,7 +94,7 @@ def calibrate(
     if result.is_usable:
         model = result.folder / "model.yaml"
         print_line(f"In the driver's configuration of the arm: model: {model.resolve()}")
-        suggest(f"dvrk-drake control {connected.as_text()} --model {model} --friction-ratio 0.3")
+        suggest(f"dvrk-drake control {connected.as_text()} --model {model} --mode guide --friction-ratio 0.3")
     else:
         print_warning("a joint failed the validation; look at the reports before you use the models")
 
