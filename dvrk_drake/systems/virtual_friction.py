@@ -53,7 +53,9 @@ def virtual_friction(
         kd: Damping (n,) of an attached joint, at most the slip effort.
         slip: Efforts (n,) at which the springs slide.
         stiffness: Stiffness (n,) of the springs.
-        drift: Largest efforts (n,) of the damping of the free joints, while no hand moves the arm.
+        drift: Largest efforts (n,) of the damping of the free joints, while no hand moves the arm. It decays to zero
+            at the speed of a joint that a hand moves, so that it also slows a joint which a large error of the model
+            accelerates before the spring attaches.
         rest: Distances (n,) by which the slow motion of a joint at rest may differ from its second filter.
         travel: Distances (n,) from the place of the spring at which it breaks away.
         jump: Distances (n,) that no joint moves in one period.
@@ -85,7 +87,7 @@ def virtual_friction(
             place[i] = np.nan
         most = 0.0
         if num_moving < MIN_MOVING:
-            most = drift[i] * max(1.0 - abs(rate[i]) * FILTER_TIME / rest[i], 0.0)
+            most = drift[i] * min(max(MOVING_RATIO - abs(rate[i]) * FILTER_TIME / rest[i], 0.0), 1.0)
         if np.isnan(place[i]):
             strength[i] *= 1.0 - min(period / DECAY_TIME, 1.0)
         else:

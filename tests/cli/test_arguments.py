@@ -95,7 +95,7 @@ def test_invalid_arguments_give_one_line(arguments, message, capsys):
 
 
 def test_rejects_too_few_numbers(capsys):
-    assert "--gravity needs 3 values, got 2" in refused(capsys, "equations", "--arm", "psm", "--gravity", "1", "2")
+    assert "--gravity needs three numbers" in refused(capsys, "equations", "--arm", "psm", "--gravity", "1", "2")
 
 
 HELP = """

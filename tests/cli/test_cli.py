@@ -21,7 +21,7 @@ from dvrk_drake.dynamics.static_model import static_model
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.sdf_model import MODELS_FOLDER
-from dvrk_drake.processes import connection, simulated_arm
+from dvrk_drake.processes import arm_session, simulated_arm
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.recordings.writing import write_recording
@@ -59,7 +59,7 @@ def test_identify_writes_files_and_prints_parameters(folder, identified_poses, t
     assert np.sqrt(np.mean(error[:, 1:6] ** 2, axis=0)).max() < 0.005
     # The function gives the same model.
     np.testing.assert_allclose(model.theta, identified_poses.result.model.theta, rtol=1e-6, atol=1e-9)
-    assert {p.name for p in plots.iterdir()} == {"efforts.png", "predicted.png", "residuals.png", "error_budget.png"}
+    assert {p.name for p in plots.iterdir()} == {"efforts.png", "residuals.png", "error_budget.png"}
 
 
 def test_validate_writes_json(folder, capsys):
@@ -277,7 +277,7 @@ def test_commands_print_the_written_paths(command, written, folder, tmp_path, mo
 
 def test_validate_keeps_a_folder_with_files(folder, tmp_path, capsys):
     validate = ["validate", f"{folder}/other.csv", "--model", f"{folder}/model.yaml", "--plots", str(tmp_path)]
-    mine = tmp_path / "predicted.png"
+    mine = tmp_path / "residuals.png"
     mine.write_text("mine")
     assert "folder is not empty" in fails(capsys, *validate)
     assert mine.read_text() == "mine" and len(list(tmp_path.iterdir())) == 1
@@ -373,8 +373,8 @@ def test_interrupt_is_not_lost_in_extension_modules(command, tmp_path, monkeypat
             signal.sigtimedwait([], 0)  # lets Python call the handler
         sys.exit("the interrupt was lost")
 
-    monkeypatch.setattr(connection, "first_status", lambda link: (lcmt_dvrk_status(), 1e-3))
-    monkeypatch.setattr(connection, "ArmController", calls_extension_module)
+    monkeypatch.setattr(arm_session, "first_status", lambda link: (lcmt_dvrk_status(), 1e-3))
+    monkeypatch.setattr(arm_session, "ArmController", calls_extension_module)
     monkeypatch.setattr(simulated_arm, "SimulatedArm", calls_extension_module)
     monkeypatch.setattr(sys, "argv", ["dvrk-drake", *words, "--arm", "mtml", "--lcm-url", "memq://"])
     code, printed = forked_program(main)

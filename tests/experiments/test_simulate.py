@@ -155,7 +155,7 @@ def test_other_commands_read_the_recording(tmp_path, capsys, monkeypatch):
             "durations=2",
             'psm: key "durations" is unknown; did you mean "duration"? allowed in a scenario: arm, closure',
         ),
-        ("controller.kp=2", 'controller: key "kp" is unknown; allowed in controller: mode, model'),
+        ("controller.kp=2", 'controller: key "kp" is unknown; allowed in controller: mode, release_time'),
         ("targets=[{tim: 1}]", 'targets[0]: key "tim" is unknown; did you mean "time"? allowed in targets: time, pose'),
         ("duration=long", 'psm: duration is "long"; allowed: a number'),
         ("controller.parameter_error=abc", 'psm: controller.parameter_error is "abc"; allowed: a number'),

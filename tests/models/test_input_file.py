@@ -103,6 +103,7 @@ def test_deeply_nested_files_are_refused_with_their_line(tmp_path):
     path.write_text("[" * 100_000)
     with pytest.raises(ModelError, match="nested too deeply"):
         GravityCompensationFile.load(path)
+    path = tmp_path / "deep.sdf"
     path.write_text('<sdf><model name="a">' + "<link>" * 100_000)
     with pytest.raises(ArmError, match="nested deeper than 50 levels"):
         compose_sdf([str(path)])

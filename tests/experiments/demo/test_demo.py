@@ -103,7 +103,7 @@ def test_demo_page_has_verdict_and_next_commands(result, held):
     folder = result[0]
     page = demo_page(held, folder)
     assert page.answer.startswith("Verdict: in mode guide, the identified model holds the released MTML for 4 s.")
-    assert "With the model of the SDF, the largest drift of the same arm is" in page.answer
+    assert "With the model of the SDF in mode gravity, the largest drift of the same arm is" in page.answer
     assert page.next_step == f"open {folder}/report.html in a browser"
     (command,) = (block.command for block in page.blocks if isinstance(block, Command))
     assert f"dvrk-drake identify {folder}/poses.csv --arm mtml" in command and "--report report.html" in command
