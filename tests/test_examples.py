@@ -23,7 +23,7 @@ SCRIPTS = [
     "02_gravity_of_any_robot.py",
     "05_hold.py",
     "06_guide.py",
-    "07_inverse_kinematics.py",
+    "11_inverse_kinematics.py",
     "08_own_controller.py",
     "10_teleoperation.py",
     "arms_and_table.py",
@@ -47,6 +47,7 @@ def test_all_scripts_are_tested():
         *SCRIPTS,
         "03_identify.py",
         "04_validate_on_another_day.py",
+        "07_force_at_the_tip.py",  # the docstring example of `estimate_force` has the same steps
         "09_hardware_station.py",  # tests/udp/test_connect_udp.py
     }
 

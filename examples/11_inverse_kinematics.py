@@ -4,7 +4,7 @@
 # ///
 """Computes all poses in which the tool of a PSM reaches points on a circle, and the efforts that hold them.
 
-python 07_inverse_kinematics.py [INSTRUMENT]     e.g. PROGRASP_FORCEPS_420093; default: large needle driver
+python 11_inverse_kinematics.py [INSTRUMENT]     e.g. PROGRASP_FORCEPS_420093; default: large needle driver
 """
 
 import sys
