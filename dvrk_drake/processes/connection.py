@@ -161,7 +161,7 @@ class ArmConnection(ArmSession):
         """Records the measurements of the arm until `dialog.stopped` returns true. The arm gets no command.
 
         Args:
-            path: New file: *.mcap, or over LCM also *.csv or *.log.
+            path: New file with the ending .mcap, or over LCM also .csv or .log.
             duration: Duration since the first measurement [s].
 
         Returns:
