@@ -100,6 +100,7 @@ def test_page_has_answer_tables_plots_and_next_step(name, tmp_path, monkeypatch)
 
 
 @pytest.mark.slow
+@pytest.mark.all_widths
 @pytest.mark.parametrize("name", COMMANDS)
 def test_pages_at_all_widths(name, open_page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
