@@ -159,7 +159,8 @@ def identified(arm, path):
     simulator.AdvanceTo(MOTION)
     state, effort = (log.FindLog(context).data().T for log in logs)
     q, v = np.split(state, 2, axis=1)
-    dvrk.identify(dvrk.Recording(t=logs[0].FindLog(context).sample_times(), q=q, qd=v, tau=effort), arm).model.save(path)
+    recording = dvrk.Recording(t=logs[0].FindLog(context).sample_times(), q=q, qd=v, tau=effort)
+    dvrk.identify(recording, arm).model.save(path)
 
 
 def main() -> None:
