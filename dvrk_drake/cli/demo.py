@@ -44,7 +44,7 @@ def demo(
         steps("drawing", 0.0)
         page = write_demo(result, output, command_words)
     show_page(page, verbose=verbose)
-    print_written(output)
+    print_written(output / "report.html", "open it in a browser")
 
 
 @app.command(group=SIMULATE)

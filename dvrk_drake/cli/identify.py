@@ -47,11 +47,9 @@ def _gravity(argument: object, tokens: Sequence[Token]) -> tuple[float, float, f
     """Converts the words after --gravity or --mount. Raises ValueError unless they are numbers or "estimate"."""
     if [token.value for token in tokens] == ["estimate"]:
         return "estimate"
-    try:
-        return gravity_vector(argument, tokens)
-    except ValueError as error:
-        stated = str(error)
-        raise ValueError(stated + ", or the word estimate" if stated.endswith("numbers [m/s^2]") else stated) from None
+    if len(tokens) != 3 and {token.keyword for token in tokens} == {"--gravity"}:
+        raise ValueError("--gravity needs three numbers [m/s^2], or the word estimate")
+    return gravity_vector(argument, tokens)
 
 
 OwnGravity = Annotated[

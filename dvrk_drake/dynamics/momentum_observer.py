@@ -13,6 +13,10 @@ from dvrk_drake.dynamics.dynamic_model import is_loaded
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ControllerError, ModelError
 
+#: Default bandwidth [rad/s], for which the errors were measured (benchmarks/external_force.py). The estimate is late by
+#: 33 ms.
+BANDWIDTH = 30.0
+
 
 class MomentumObserver:
     """Observer of the generalized momentum of an arm (De Luca and Mattone, ICRA 2003).
@@ -33,7 +37,7 @@ class MomentumObserver:
         size: Number of elements of the state.
     """
 
-    def __init__(self, model: IdentifiedModel, *, bandwidth: float = 15.0, period: float = 1e-3) -> None:
+    def __init__(self, model: IdentifiedModel, *, bandwidth: float = BANDWIDTH, period: float = 1e-3) -> None:
         """Reads the model.
 
         Args:

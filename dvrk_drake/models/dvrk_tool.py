@@ -49,10 +49,9 @@ _JAW_EFFORT = 0.16
 #: Inertia [kg m^2] and gear ratio of the motor of a disc, see large_needle_driver.sdf.
 _ROTOR, _GEAR = 1e-6, 11.71
 _VELOCITIES = (2.0, 2.0, 3.0, 3.0)
-_QUARTER, _DOWN = (
-    np.pi / 2,
-    RigidTransform(RotationMatrix(np.array([[0.0, -1, 0], [-1, 0, 0], [0, 0, -1]])), np.zeros(3)),
-)
+_QUARTER = np.pi / 2
+#: Pose of the frame that carries an instrument in the base frame, without an arm: z points down along the shaft.
+_DOWN = RigidTransform(RotationMatrix(np.array([[0.0, -1, 0], [-1, 0, 0], [0, 0, -1]])), np.zeros(3))
 
 
 @dataclass

@@ -84,11 +84,8 @@ class _RemoteCenterArm:
         yaw, pitch, insertion, roll = (_axis(joint, self._context) for joint in joints)
         X_BS = self._shaft.CalcPoseInWorld(self._context)
         # The axes at the home pose: yaw, pitch and shaft are orthogonal.
-        self._axes, self._R_BS, self._roll_sign = (
-            (yaw, pitch),
-            X_BS.rotation().matrix(),
-            float(np.sign(roll @ X_BS.rotation().col(2))),
-        )
+        self._axes, self._R_BS = (yaw, pitch), X_BS.rotation().matrix()
+        self._roll_sign = float(np.sign(roll @ X_BS.rotation().col(2)))
         self._insertion_sign = float(np.sign(insertion @ X_BS.rotation().col(2)))
         self._home_depth = float((X_BS.translation() - self._center) @ X_BS.rotation().col(2))
         self._wrist = self._moved_joints(np.arange(4, arm.num_joints))

@@ -6,13 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.dynamics.momentum_observer import MomentumObserver
+from dvrk_drake.dynamics.momentum_observer import BANDWIDTH, MomentumObserver
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.processes.control import StatusHandler
 
-#: Bandwidth of the observer [rad/s], as the default of `ExternalForceEstimator`.
-BANDWIDTH = 30.0
 #: Longest time between two measurements [s] over which the estimate is continued: three time constants. After a longer
 #: gap, it starts from 0.
 _MAX_GAP = 3.0 / BANDWIDTH
@@ -41,7 +39,7 @@ class ContactStop:
             ModelError: The model was identified from static poses, or does not state its errors.
             ControllerError: The rate of false alarms is out of range.
         """
-        self._observer, self._handler = MomentumObserver(model, bandwidth=BANDWIDTH), handler
+        self._observer, self._handler = MomentumObserver(model), handler
         self._threshold = self._observer.threshold(false_alarms_per_hour)
         self._state, self._utime = self._observer.start(), 0
         self._observer.covariance(self._state)

@@ -15,7 +15,7 @@ from dvrk_drake.models.files import atomic_write
 from dvrk_drake.reports.colours import FITTED, LIMIT, NEUTRAL, REFERENCE
 from dvrk_drake.reports.html_file import write_html
 from dvrk_drake.reports.image_files import write_images
-from dvrk_drake.reports.page import Block, Command, Page, Plot, Scene, Section, Table, Text
+from dvrk_drake.reports.page import Block, Page, Plot, Scene, Section, Table, Text
 from dvrk_drake.reports.plot import Curve, Guide, Mark, Panel, joint_label
 from dvrk_drake.reports.provenance import Provenance
 
@@ -85,8 +85,8 @@ def demo_page(result: DemoResult, folder: Path) -> Page:
         Text(
             "The simulated arm has the friction, cables, stops and sensors of the arm file. Its links are "
             f"{low:g} to {high:g} times as heavy as in the SDF, except for its counterweights. At the start of the "
-            "release, its friction carries no load. After an approach from one side, a joint can move back or slip "
-            "further than the limit.",
+            "release, its friction carries no load. After an approach from one side, gravity compensation alone lets a "
+            "joint move further than the limit.",
             show="details",
         ),
         Text(_REAL_ARM, show="details"),
@@ -94,7 +94,6 @@ def demo_page(result: DemoResult, folder: Path) -> Page:
     view = folder / "arm.html"
     caption = "Identified model in mode guide (grey), model of the SDF in mode gravity (green)"
     scene = [Scene(view.read_text, caption, start=float(result.time[0]))]
-    identify = f"dvrk-drake identify {folder}/poses.csv --arm {arm.source} --output MODEL.yaml --report report.html"
     return Page(
         f"Demo: {arm.name}, simulated",
         f"Verdict: in mode guide, the identified model {'holds' if held else 'does not hold'} the released {arm.name} "
@@ -103,10 +102,10 @@ def demo_page(result: DemoResult, folder: Path) -> Page:
         [
             Section("Drift and torque errors", blocks),
             Section("Release", [*scene, _drift_plot(result)]),
-            Section("With your own recording", [Command(identify, "Plots and parameters with intervals.")]),
         ],
         "good" if held else "warning",
-        f"open {folder}/report.html in a browser",
+        f"dvrk-drake identify {folder}/poses.csv --arm {arm.source} --output MODEL.yaml --report report.html",
+        "Identifies a model from the poses of the demo, or from your own recording.",
     )
 
 

@@ -49,7 +49,7 @@ def motion_page(design: ExcitationDesign, *, next_step: str | None = None) -> Pa
         answer,
         [
             Section("Information", [Table(("quantity", "value"), rows, note=note)]),
-            Section("One period", [_view(arm, t, q), _position_plot(arm, t, q, "t [s]", "line", time=True)]),
+            Section("One period", [_view(arm, t, q), _position_plot(arm, t, q, "t [s]", "line")]),
             Section("Range of each joint", [_range_table(arm, q, speeds)]),
         ],
         "good",
@@ -75,7 +75,7 @@ def poses_page(design: StaticPoseDesign, *, next_step: str | None = None) -> Pag
         ("gravity parameters known to 10 %", f"{design.known_parameters} of {design.num_parameters}"),
     ]
     count = np.arange(1.0, len(poses) + 1)
-    views: list[Block] = [_view(arm, count, poses), _position_plot(arm, count, poses, "pose", "circles", time=True)]
+    views: list[Block] = [_view(arm, count, poses), _position_plot(arm, count, poses, "pose", "circles")]
     return Page(
         f"Designed static poses of {arm.name}",
         answer,
@@ -98,9 +98,7 @@ def _view(arm: Arm, t: NDArray[np.float64], q: NDArray[np.float64]) -> Scene:
     return Scene(html, "Arm at the desired positions", float(t[0]))
 
 
-def _position_plot(
-    arm: Arm, x: NDArray[np.float64], q: NDArray[np.float64], x_label: str, style: Style, time: bool
-) -> Plot:
+def _position_plot(arm: Arm, x: NDArray[np.float64], q: NDArray[np.float64], x_label: str, style: Style) -> Plot:
     """Returns the positions q (m, n) over x (m,), with the position limits."""
     panels = []
     for j in range(arm.num_joints):
@@ -120,7 +118,7 @@ def _position_plot(
                 x_ticks=last,
             )
         )
-    return Plot("positions", "Desired positions and position limits", panels, time=time)
+    return Plot("positions", "Desired positions and position limits", panels, time=True)
 
 
 def _range_table(arm: Arm, q: NDArray[np.float64], speeds: Sequence[float] | NDArray[np.float64] = ()) -> Table:

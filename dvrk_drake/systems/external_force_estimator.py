@@ -11,7 +11,7 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 
 from dvrk_drake.dynamics.contact import Contact, is_measurable
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.dynamics.momentum_observer import MomentumObserver
+from dvrk_drake.dynamics.momentum_observer import BANDWIDTH, MomentumObserver
 from dvrk_drake.errors import ArmError, ControllerError
 from dvrk_drake.models.arm_schema import IMPLAUSIBLE
 
@@ -75,7 +75,7 @@ class ExternalForceEstimator(LeafSystem):
         model: IdentifiedModel,
         *,
         contact: Contact | None = None,
-        bandwidth: float = 30.0,
+        bandwidth: float = BANDWIDTH,
         same_day: bool = False,
         false_alarms_per_hour: float = 1.0,
         period: float = 1e-3,

@@ -106,7 +106,7 @@ class DemoResult:
         return self.arm.per_joint(*BAND)
 
     def holds(self, model: str) -> bool:
-        """Tells whether all joints of the released arm stay within `limits` with a model of `drifts`."""
+        """Returns whether all joints of the released arm stay within `limits` with a model of `drifts`."""
         return bool(np.all(self.drifts[model] <= self.limits))
 
 
