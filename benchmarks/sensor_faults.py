@@ -11,9 +11,10 @@ columns are:
 
     found       number of trials in which the guard detected the fault within 3 s, and of all trials
     ms          time from the fault to its detection [ms]
-    before      motion of the joint from the fault to its detection, or in 3 s without detection [rad, 0.1 m]
-    after       motion of the joint within 0.6 s after the detection [rad, 0.1 m]
-    speed       largest speed of any joint, from 50 ms after the detection on [rad/s, 0.1 m/s]
+    before      motion of the joint from the fault to its detection, or in 3 s without detection [rad, m]
+    after       motion of the joint within 0.6 s after the detection [rad, m]
+    speed       largest speed of any revolute joint, from 50 ms after the detection on [rad/s]
+    prismatic   the same of any prismatic joint [m/s]
 
 With --delays, position and velocity of one joint or of all joints are delayed by these times [ms], without a change of
 their time stamps. A delayed control loop oscillates. The table states whether the guard reported a fault within 2 s,
@@ -102,16 +103,14 @@ def motion_trials(task) -> list[tuple[str, int, object]]:
     return trials
 
 
-def summary(arm, trials) -> str:
+def summary(arm, trials, displacements=True) -> str:
     """Returns the cells of a row: found, and the median and the largest value of each quantity."""
-    found = [(joint, o) for _, joint, o in trials if np.isfinite(o.detected)]
-    scale = arm.per_joint(1.0, 10.0)
-    columns = (
-        ([1e3 * o.detected for _, o in found], "{:.0f}"),
-        ([scale[joint] * o.before for _, joint, o in trials], "{:.2f}"),
-        ([scale[joint] * o.after for joint, o in found], "{:.2f}"),
-        ([o.speed for _, o in found], "{:.1f}"),
-    )
+    found = [o for _, _, o in trials if np.isfinite(o.detected)]
+    columns = [([1e3 * o.detected for o in found], "{:.0f}")]
+    if displacements:
+        columns += [([o.before for _, _, o in trials], "{:.3f}"), ([o.after for o in found], "{:.3f}")]
+    for joints, form in ((~arm.prismatic, "{:.1f}"), (arm.prismatic, "{:.2f}")):
+        columns.append(([np.max(o.speed[joints]) for o in found if joints.any()], form))
     cells = [f"{len(found)}/{len(trials)}"]
     for values, form in columns:
         cells += [form.format(x) for x in (np.median(values), max(values))] if values else ["-", "-"]
@@ -122,15 +121,24 @@ def print_tables(name, trials_by_use) -> None:
     """Prints one row per use and group of joints, one row per fault, and the slowest detections."""
     arm = load_arm(name)
     every = [trial for trials in trials_by_use.values() for trial in trials]
-    heading = "| found | ms: median | max | before: median | max | after: median | max | speed: median | max |"
-    print(f"\n{name}: {len(every)} random trials\n\n| use, joints {heading}\n|---|---|---|---|---|---|---|---|---|---|")
+    speeds = "speed: median | max | prismatic: median | max |"
+    moved = "before: median | max | after: median | max | "
+    print(f"\n{name}: {len(every)} random trials\n\n| use, joints | found | ms: median | max | {moved}{speeds}")
+    print("|" + 12 * "---|")
+    # The first three joints carry the others. Displacements of revolute and prismatic joints have different units.
+    groups = [
+        [j for j in part if arm.prismatic[j] == kind]
+        for part in (range(3), range(3, arm.num_joints))
+        for kind in (0, 1)
+    ]
     for use, trials in trials_by_use.items():
-        for group, joints in (("1 to 3", range(3)), (f"4 to {arm.num_joints}", range(3, arm.num_joints))):
-            print(f"| {use}, {group} | {summary(arm, [t for t in trials if t[1] in joints])} |")
-    print(f"\n| fault {heading}\n|---|---|---|---|---|---|---|---|---|---|")
+        for joints in filter(None, groups):
+            label = ", ".join(str(j + 1) for j in joints)
+            print(f"| {use}, {label} | {summary(arm, [t for t in trials if t[1] in joints])} |")
+    print(f"\n| fault | found | ms: median | max | {speeds}\n|" + 8 * "---|")
     for fault in FAULTS:
         if rows := [t for t in every if t[0] == fault]:
-            print(f"| {fault} | {summary(arm, rows)} |")
+            print(f"| {fault} | {summary(arm, rows, displacements=False)} |")
     print("\nslowest detections and undetected faults:")
     for fault, joint, o in sorted(every, key=lambda t: -t[2].detected)[:12]:
         print(f"{fault:18} {arm.joint_names[joint]:16} {1e3 * o.detected:6.0f} ms  before {o.before:.2f}  {o.text}")

@@ -9,7 +9,7 @@ DOCS = Path(__file__).resolve().parent
 sys.path.insert(0, str(DOCS))  # for the extension `pydrake_system`
 # The notebooks call `dvrk-drake`, and import the helper `embed`.
 os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-os.environ["PYTHONPATH"] = str(DOCS / "tutorials")
+os.environ["PYTHONPATH"] = os.pathsep.join([str(DOCS / "tutorials"), *filter(None, [os.environ.get("PYTHONPATH")])])
 # Width of the tables that commands print. Wider lines do not fit into the page.
 os.environ["COLUMNS"] = "88"
 

@@ -104,7 +104,7 @@ def reproduce(
 
     Args:
         what: Table, figure or experiment to reproduce.
-        data: Folder with mtm_2015_good72.csv (docs/reproduction.md). Default: $DVRK_DRAKE_SHARED/data/mtm_static.
+        data: Folder with mtm_2015_good72.csv (docs/public_recordings.md). Default: $DVRK_DRAKE_SHARED/data/mtm_static.
     """
     from dvrk_drake.experiments.reproduction.published import PaperRecordings
     from dvrk_drake.reports.reproduction.page import NAMES

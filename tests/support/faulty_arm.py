@@ -106,7 +106,7 @@ class Outcome:
         detected: Time from the fault to its detection [s]; inf if it was not detected.
         text: Fault text of the guard.
         before, after: Largest displacement of the joint before and after the detection of the fault [rad, m].
-        speed: Largest speed of any joint at least 50 ms after detection, divided by 1 rad/s or 0.1 m/s.
+        speed: Largest speed (n,) of each joint at least 50 ms after detection [rad/s, m/s].
         effort: Largest effort of any joint at least 50 ms after detection, as a fraction of its limit.
     """
 
@@ -114,7 +114,7 @@ class Outcome:
     text: str
     before: float
     after: float
-    speed: float
+    speed: np.ndarray
     effort: float
 
 
@@ -212,15 +212,14 @@ class FaultyArm:
             self.step()
             before = max(before, abs(self.state()[0][joint] - start))
         if self.guard.state != Status.STATE_FAULT:
-            return Outcome(np.inf, "", before, 0.0, 0.0, 0.0)
+            return Outcome(np.inf, "", before, 0.0, np.zeros(self.arm.num_joints), 0.0)
         detected, found = (self.ticks - ended) * PERIOD, self.state()[0][joint]
-        after = speed = effort = 0.0
-        scale = self.arm.per_joint(1.0, 0.1)
+        after, speed, effort = 0.0, np.zeros(self.arm.num_joints), 0.0
         for k in range(round(seconds / PERIOD)):
             self.step()
             q, v = self.state()
             after = max(after, abs(q[joint] - found))
             if k >= 50:
                 effort = max(effort, np.max(np.abs(self.effort()) / self.arm.effort_limits))
-                speed = max(speed, np.max(np.abs(v) / scale))
+                speed = np.maximum(speed, np.abs(v))
         return Outcome(detected, self.guard.fault_text, before, after, speed, effort)

@@ -126,7 +126,7 @@ _PREFACE = (
 )
 _NEXT_DATA = (
     "dvrk-drake reproduce all --folder reproduction --data FOLDER",
-    "Computes all results. FOLDER contains the recording of the paper (docs/reproduction.md).",
+    "Computes all results. FOLDER contains the recording of the paper (docs/public_recordings.md).",
 )
 _NEXT_STUDY = (
     "dvrk-drake simulate study examples/release_study.yaml --output release.csv --report release.html",
