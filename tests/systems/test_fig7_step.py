@@ -4,15 +4,12 @@ import dataclasses
 
 import numpy as np
 import pytest
-from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import LogVectorOutput
+from controlled_arm import ControlledArm
+from pydrake.systems.primitives import ConstantVectorSource
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.experiments.reproduction.published import PAPER
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.systems.arm_station import ArmStation
-from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
 ARM = load_arm("mtml")
 NOMINAL = IdentifiedModel.from_arm(ARM)
@@ -25,22 +22,16 @@ def scaled_model(factor):
 
 def simulate(q0, q_desired, duration, gravity_factor=1.0):
     """Returns times (m,), errors q - q_d (m, n) and efforts (m, n), every millisecond, with default gains."""
-    builder = DiagramBuilder()
-    station = builder.AddSystem(ArmStation(ARM))
-    controller = builder.AddSystem(GravityPidController(scaled_model(gravity_factor)))
-    builder.Connect(station.GetOutputPort("mtml.state_estimated"), controller.GetInputPort("state_estimated"))
-    builder.Connect(controller.GetOutputPort("effort"), station.GetInputPort("mtml.effort_commanded"))
-    positions = LogVectorOutput(station.GetOutputPort("mtml.position_measured"), builder, 1e-3)
-    efforts = LogVectorOutput(controller.GetOutputPort("effort"), builder, 1e-3)
-    simulator = Simulator(builder.Build())
-    context = simulator.get_mutable_context()
-    controller.GetInputPort("desired_state").FixValue(
-        controller.GetMyMutableContextFromRoot(context), np.concatenate([q_desired, np.zeros(ARM.num_joints)])
-    )
-    station.SetPositions(station.GetMyMutableContextFromRoot(context), q0)
-    simulator.AdvanceTo(duration)
-    log = positions.FindLog(context)
-    return log.sample_times(), log.data().T - np.asarray(q_desired), efforts.FindLog(context).data().T
+    desired = ConstantVectorSource(np.concatenate([q_desired, np.zeros(ARM.num_joints)]))
+    arm = ControlledArm(ARM, q0, scaled_model(gravity_factor), mode="hold", desired=desired)
+    effort, controller = arm.controller.GetOutputPort("effort"), arm.controller_context
+    times, errors, efforts = 1e-3 * np.arange(round(1e3 * duration) + 1), [], []
+    arm.simulator.Initialize()
+    for t in times:
+        errors.append(arm.q - q_desired)
+        efforts.append(effort.Eval(controller).copy())
+        arm.simulator.AdvanceTo(t + 1e-3)
+    return times, np.array(errors), np.array(efforts)
 
 
 @pytest.mark.parametrize("gravity_factor", [1.2, *(pytest.param(f, marks=pytest.mark.slow) for f in (1.0, 0.8))])
@@ -79,14 +70,9 @@ def test_steady_state_error_is_the_gravity_error_over_kp():
     # Without the integral, at rest, Kp e = (true - modelled) gravity at that pose.
     gains = dataclasses.replace(ARM.gains, ki=[0.0] * 7)
     model = scaled_model(0.8)
-    builder = DiagramBuilder()
-    station = builder.AddSystem(ArmStation(ARM))
-    controller = builder.AddSystem(GravityPidController(model, gains=gains))
-    builder.Connect(station.GetOutputPort("mtml.state_estimated"), controller.GetInputPort("state_estimated"))
-    builder.Connect(controller.GetOutputPort("effort"), station.GetInputPort("mtml.effort_commanded"))
-    simulator = Simulator(builder.Build())
-    simulator.AdvanceTo(8.0)  # holds the initial pose, zero
-    q = station.GetPositions(station.GetMyContextFromRoot(simulator.get_context()))
+    arm = ControlledArm(ARM, np.zeros(7), model, mode="hold", gains=gains)
+    arm.simulator.AdvanceTo(8.0)
+    q = arm.q
     missing = NOMINAL.holding_torque(q) - model.holding_torque(q)
     np.testing.assert_allclose(np.asarray(gains.kp) * (0 - q), missing, atol=1e-6)
     assert np.abs(q).max() > 1e-3

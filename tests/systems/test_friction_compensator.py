@@ -1,7 +1,5 @@
 """Friction compensation: same elements as the identified friction, passivity, no creep."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
@@ -19,7 +17,6 @@ from dvrk_drake.dynamics.friction_compensation import (
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.models.effects_schema import DelayEffect
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.friction_compensator import FrictionCompensator
@@ -196,20 +193,6 @@ def test_sum_is_clamped_to_effort_limits():
     assert np.all(effort <= ARM.effort_limits) and np.any(effort == ARM.effort_limits)
 
 
-def test_elements_restart_relaxed():
-    builder = DiagramBuilder()
-    system = builder.AddSystem(FrictionCompensator(FRICTION, holding_error=NO_EFFORT))
-    builder.ExportInput(system.GetInputPort("state_estimated"))
-    builder.ExportInput(system.GetInputPort("effort_wanted"))
-    diagram = builder.Build()
-    context = diagram.CreateDefaultContext()
-    context.get_mutable_discrete_state(0).SetFromVector(np.ones(context.get_discrete_state(0).size()))
-    diagram.get_input_port(0).FixValue(context, np.concatenate([np.full(7, 0.1), NO_EFFORT]))
-    diagram.get_input_port(1).FixValue(context, NO_EFFORT)
-    diagram.ExecuteInitializationEvents(context)
-    assert np.all(system.GetOutputPort("friction_effort").Eval(system.GetMyContextFromRoot(context)) == 0)
-
-
 @pytest.mark.parametrize(
     ("options", "what"),
     [
@@ -245,37 +228,6 @@ def test_active_friction_is_refused():
         Friction.of(ARM, EFFECTS, -COEFFICIENTS)
     with pytest.raises(ControllerError, match=r"allowed: actuator\.outer_yaw"):
         Friction.of(ARM, [ActuatorEffect("actuator.nose", "viscous")], [1.0])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(2))
-def test_push_decays_with_less_friction_and_delay(seed):
-    laws = [dataclasses.replace(law, coefficient=0.7 * law.coefficient) for law in ARM.effects.friction]
-    effects = dataclasses.replace(
-        ARM.effects.without("cables").without("springs"), friction=laws, delay=DelayEffect(measurement=1, command=1)
-    )
-    station = ArmStation(ARM, effects=effects, seed=seed)
-    friction = FrictionCompensator(
-        Friction.of_arm(ARM), ratio=MAX_RATIO, hysteresis_ratio=MAX_HYSTERESIS_RATIO, holding_error=NO_EFFORT
-    )
-    builder = DiagramBuilder()
-    add_closed_loop(
-        builder, station, GravityPidController(IdentifiedModel.from_arm(ARM), mode="gravity"), friction=friction
-    )
-    simulator = Simulator(builder.Build())
-    context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
-    generator = np.random.default_rng(seed)
-    station.SetPositions(context, ARM.sample_poses(1, generator, margin=0.2)[0])
-    push = 2 * holding_friction(Friction.of_arm(ARM)) * generator.choice([-1.0, 1.0], 7)
-    station.GetInputPort("mtml.effort_disturbance").FixValue(context, push)
-    simulator.AdvanceTo(0.3)
-    state = station.GetOutputPort("mtml.state_true")
-    assert np.abs(state.Eval(context)[7:]).max() > 0.3
-    station.GetInputPort("mtml.effort_disturbance").FixValue(context, NO_EFFORT)
-    simulator.AdvanceTo(6.0)
-    stopped = state.Eval(context)[:7].copy()
-    simulator.AdvanceTo(6.5)
-    assert np.abs(state.Eval(context)[:7] - stopped).max() < 2e-3
 
 
 def released(ratio, error, holding_error, seconds=1.5):

@@ -5,8 +5,6 @@ import dataclasses
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import ConstantVectorSource
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ControllerError, ModelError
@@ -52,19 +50,6 @@ class Bench:
         return self.controller.GetOutputPort(name).Eval(self.context)
 
 
-def test_ports():
-    controller = GravityPidController(MODEL)
-    inputs = [controller.get_input_port(i) for i in range(controller.num_input_ports())]
-    outputs = [controller.get_output_port(i) for i in range(controller.num_output_ports())]
-    assert [(p.get_name(), p.size()) for p in inputs] == [
-        ("state_estimated", 2 * N),
-        ("desired_state", 2 * N),
-    ]
-    assert [(p.get_name(), p.size()) for p in outputs] == [("effort", N), ("gravity_effort", N), ("fault", 1)]
-    # All outputs are held between updates: no algebraic loop with a plant that feeds through.
-    assert not controller.HasAnyDirectFeedthrough()
-
-
 @pytest.mark.parametrize("q", POSES)
 def test_gravity_mode_equals_plant_gravity(q):
     plant = make_arm_plant(ARM)
@@ -102,16 +87,6 @@ def test_damped_mode_only_adds_damping():
     for q in POSES:  # at any distance from the start
         np.testing.assert_allclose(bench.step(q, v), MODEL.holding_torque(q) - np.multiply(GAINS.kd, v), atol=1e-12)
     np.testing.assert_allclose(bench.step(q, np.full(N, np.nan)), MODEL.holding_torque(q), atol=1e-12)
-
-
-@pytest.mark.parametrize("j", range(N))
-def test_damping_acts_only_on_its_joint(j):
-    # The paper's node used positions in the damping of joints 5-7: large positions must not affect it.
-    q = POSES[2] + 1.0
-    bench = Bench(np.concatenate([q, np.zeros(N)]), gains=GAINS, effort_limits=UNLIMITED)
-    still = bench.initialize(q)
-    v = 0.3 * np.eye(N)[j]
-    np.testing.assert_allclose(bench.step(q, v) - still, -GAINS.kd[j] * v, atol=1e-12)
 
 
 def test_effort_is_clamped_and_gravity_effort_is_not():
@@ -224,36 +199,6 @@ def test_gravity_mode_ignores_desired_state():
     bench = Bench(np.full(2 * N, np.nan), mode="gravity")
     bench.initialize(POSES[0])
     assert bench.output("fault") == [0.0]
-
-
-def test_forced_update_is_the_periodic_update():
-    one, two = (Bench(gains=GAINS) for _ in range(2))
-    for bench in (one, two):
-        bench.initialize(POSES[0])
-    expected = one.step(POSES[0] + 1e-3)
-    two.set_state(POSES[0] + 1e-3)
-    discrete_state = two.controller.AllocateDiscreteVariables()
-    two.controller.CalcForcedDiscreteVariableUpdate(two.context, discrete_state)
-    two.context.SetDiscreteState(discrete_state)
-    np.testing.assert_allclose(two.output("effort"), expected, atol=1e-12)
-
-
-def test_simulator_holds_the_output_between_updates():
-    builder = DiagramBuilder()
-    controller = builder.AddSystem(GravityPidController(MODEL, period=0.01, gains=GAINS))
-    state = builder.AddSystem(ConstantVectorSource(np.concatenate([POSES[0], np.zeros(N)])))
-    desired = builder.AddSystem(ConstantVectorSource(np.concatenate([POSES[0] + 1e-3, np.zeros(N)])))
-    builder.Connect(state.get_output_port(), controller.GetInputPort("state_estimated"))
-    builder.Connect(desired.get_output_port(), controller.GetInputPort("desired_state"))
-    simulator = Simulator(builder.Build())
-    simulator.Initialize()
-    context = controller.GetMyContextFromRoot(simulator.get_context())
-    port = controller.GetOutputPort("effort")
-    without_integral = MODEL.holding_torque(POSES[0]) + 1e-3 * np.array(GAINS.kp)
-    np.testing.assert_allclose(port.Eval(context), without_integral, atol=1e-12)  # from the start
-    simulator.AdvanceTo(0.055)  # updates at 0, 0.01, .. 0.05: six
-    expected = without_integral + 6 * 0.01 * 1e-3 * np.array(GAINS.ki)
-    np.testing.assert_allclose(port.Eval(context), expected, atol=1e-12)
 
 
 def test_feedforward_scale_scales_gravity():

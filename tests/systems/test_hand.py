@@ -55,21 +55,6 @@ def held_arm(grip, X_offset, duration):
     return wanted, frame.pose(state[:7]), frame.jacobian(state[:7]) @ state[7:]
 
 
-def test_frame_pose_and_jacobian_match_drake():
-    frame = ArmFrame(ARM, "dh_7")
-    plant = make_arm_plant(ARM)
-    context = plant.CreateDefaultContext()
-    set_arm_positions(plant, context, ARM, Q)
-    assert frame.pose(Q).IsNearlyEqualTo(plant.GetFrameByName("dh_7").CalcPoseInWorld(context), 1e-12)
-    h = 1e-6
-    J = frame.jacobian(Q)
-    for i, step in enumerate(h * np.eye(7)):
-        plus, minus = frame.pose(Q + step), frame.pose(Q - step)
-        rotation = (plus.rotation() @ minus.rotation().inverse()).ToAngleAxis()
-        np.testing.assert_allclose(J[:3, i], rotation.angle() * rotation.axis() / (2 * h), atol=1e-8)
-        np.testing.assert_allclose(J[3:, i], (plus.translation() - minus.translation()) / (2 * h), atol=1e-8)
-
-
 def test_mass_matrix_matches_kinetic_energy():
     # The joint inertia of the PSM includes its counterweight and linkage.
     psm = load_arm("psm")
@@ -96,12 +81,6 @@ def test_force_converges_to_spring_and_damper():
     np.testing.assert_allclose(F[:3], 2.0 * np.array([0, 0, 0.2]) - 0.03 * V[:3], rtol=1e-3, atol=1e-5)
     np.testing.assert_allclose(F[3:], 600.0 * np.array([0.01, -0.02, 0.03]) - 25.0 * V[3:], rtol=1e-3, atol=1e-3)
     np.testing.assert_allclose(tau, frame.jacobian(Q).T @ F, rtol=0, atol=1e-12 * np.abs(F).max())
-
-
-def test_force_at_rest_in_desired_pose_is_zero():
-    tau, F = evaluate(Hand(ARM), Q, np.zeros(7), ArmFrame(ARM, "dh_7").pose(Q))
-    np.testing.assert_allclose(F, 0, atol=1e-9)
-    np.testing.assert_allclose(tau, 0, atol=1e-9)
 
 
 def test_limited_force_and_torque_keep_direction():

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from controlled_arm import ControlledArm
 from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 
@@ -12,7 +12,6 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions, tree_selector
 from dvrk_drake.systems.arm_station import ArmStation
-from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
 pytestmark = pytest.mark.drake_api
 
@@ -72,13 +71,6 @@ def allowed_motion(plant, context):
     return H
 
 
-def test_only_loop_joints_lose_couplings():
-    tree, pinned = make_arm_plant(ARM), make_arm_plant(ARM, closure="ball")
-    # Six joints are dependent, four of them in two loops. Each loop gets a pin and a bar length.
-    assert tree.num_constraints() == 6
-    assert pinned.num_constraints() == len(CABLES) + 2 * len(ARM.loop_closures)
-
-
 def test_pins_and_couplings_give_the_same_dynamics():
     tree, pinned = make_arm_plant(ARM), make_arm_plant(ARM, closure="ball")
     tree_context, context = tree.CreateDefaultContext(), pinned.CreateDefaultContext()
@@ -135,22 +127,14 @@ def test_closure_and_remote_centre_during_motion(num_corners):
     knots = center + 0.98 * half * signs
     times = 3.0 * np.arange(len(knots))
     trajectory = PiecewisePolynomial.CubicHermite(times, knots.T, np.zeros_like(knots.T))
-    builder = DiagramBuilder()
-    station = builder.AddSystem(ArmStation(ARM, closure="ball"))
-    controller = builder.AddSystem(GravityPidController(IdentifiedModel.from_arm(ARM)))
-    desired = builder.AddSystem(TrajectorySource(trajectory, output_derivative_order=1))
-    builder.Connect(station.GetOutputPort("psm.state_estimated"), controller.GetInputPort("state_estimated"))
-    builder.Connect(desired.get_output_port(), controller.GetInputPort("desired_state"))
-    builder.Connect(controller.GetOutputPort("effort"), station.GetInputPort("psm.effort_commanded"))
-    simulator = Simulator(builder.Build())
-    context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
-    station.SetPositions(context, knots[0])
-    plant, select = station.plant, tree_selector(station.plant, ARM)
-    plant_context = station.GetSubsystemContext(plant, context)
+    desired = TrajectorySource(trajectory, output_derivative_order=1)
+    arm = ControlledArm(ARM, knots[0], mode="hold", desired=desired, closure="ball")
+    plant, plant_context = arm.station.plant, arm.plant_context
+    select = tree_selector(plant, ARM)
     worst, tracking, linkage, q_seen = np.zeros(2), np.zeros(N), 0.0, []
     for t in np.arange(0.005, times[-1], 0.005):
-        simulator.AdvanceTo(t)
-        q = station.GetPositions(context)
+        arm.simulator.AdvanceTo(t)
+        q = arm.q
         worst = np.maximum(worst, gaps(plant, plant_context))
         tracking = np.maximum(tracking, np.abs(q - trajectory.value(t)[:, 0]))
         linkage = max(linkage, np.abs(plant.GetPositions(plant_context)[select] - ARM.linkage.position(q)).max())
@@ -165,22 +149,10 @@ def test_closure_and_remote_centre_during_motion(num_corners):
 @pytest.mark.parametrize("closure", ["mimic", "ball"])
 def test_held_poses_keep_the_remote_centre(closure):
     """A released arm under exact gravity compensation, 0.5 s at each pose."""
-    builder = DiagramBuilder()
-    station = builder.AddSystem(ArmStation(ARM, closure=closure))
-    controller = builder.AddSystem(GravityPidController(IdentifiedModel.from_arm(ARM), mode="gravity"))
-    builder.Connect(station.GetOutputPort("psm.state_estimated"), controller.GetInputPort("state_estimated"))
-    builder.Connect(controller.GetOutputPort("effort"), station.GetInputPort("psm.effort_commanded"))
-    simulator = Simulator(builder.Build())
-    root = simulator.get_mutable_context()
-    context = station.GetMyMutableContextFromRoot(root)
     for q in box_poses(10):  # the corners and two random poses
-        root.SetTime(0.0)
-        station.SetPositions(context, q)
-        simulator.Initialize()
-        simulator.AdvanceTo(0.5)
-        worst = gaps(station.plant, station.GetSubsystemContext(station.plant, context))
-        assert np.all(worst < 1e-7)
-        assert np.abs(station.GetPositions(context) - q).max() < 5e-6
+        arm = ControlledArm(ARM, q, closure=closure)
+        assert arm.drift(0.5).max() < 5e-6
+        assert np.all(gaps(arm.station.plant, arm.plant_context) < 1e-7)
 
 
 @pytest.mark.parametrize("closure", ["mimic", "ball"])

@@ -223,7 +223,3 @@ def test_other_invalid_arguments_are_refused():
     system = Teleoperation(MTM, PSM)
     with pytest.raises(ControllerError, match="input port master_position is not connected"):
         Simulator(system).Initialize()
-
-
-def test_velocity_limits_come_from_the_sdf():
-    assert np.array_equal(Loop().system._speed, SPEED)

@@ -4,16 +4,13 @@ import itertools
 
 import numpy as np
 import pytest
-from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder
-from simulated_effects import ARMS, STEP, Run, weightless
+from controlled_arm import ControlledArm
+from simulated_effects import ARMS, STEP, Run, middle, weightless
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import ArmEffects, DelayEffect, EffortEffect, EncoderEffect
-from dvrk_drake.systems.arm_station import ArmStation
-from dvrk_drake.systems.closed_loop import add_closed_loop
-from dvrk_drake.systems.gravity_pid_controller import GravityPidController
+from dvrk_drake.systems.arm_effects.drive_force import Motors
 
 pytestmark = pytest.mark.numeric
 
@@ -126,23 +123,45 @@ def test_efforts_have_steps_and_noise():
     np.testing.assert_allclose(inverse.T @ quiet.get("effort_measured"), 10 * steps, rtol=0, atol=1e-9 * steps.max())
 
 
+def test_motors_clamp_step_and_saturate_in_this_order():
+    arm = load_arm("mtml")
+    n, inverse, limits = arm.num_joints, arm.transmission.inverse, np.full(arm.num_joints, 0.5)
+    first, second = arm.joint_names[:2]
+    effects = ArmEffects(saturation={first: 0.25}, effort=EffortEffect(command_resolution={first: 0.1, second: 0.1}))
+    # The effort does not increase beyond the joints' limits.
+    free = Motors(arm, ArmEffects(), limits)
+    np.testing.assert_allclose(free.effort(np.full(n, 9.0)), inverse.pull_back_effort(limits), atol=1e-12)
+    # 0.33 is three steps, limited to 0.25 by the motor. The second has 0.3, all others the command.
+    command = arm.transmission.pull_back_effort(np.array([0.33, -0.33, *[0.05] * (n - 2)]))
+    assert np.all(np.abs(command) <= limits)
+    effort = Motors(arm, effects, limits).effort(command)
+    np.testing.assert_allclose(effort, [0.25, -0.3, *[0.05] * (n - 2)], atol=1e-12)
+
+
+def test_drive_without_effects_is_ideal():
+    arm = weightless("mtml")
+    paths = []
+    for effects in (None, ArmEffects()):
+        run = Run(arm, effects)
+        run.fix("effort_commanded", 0.3 * arm.effort_limits)
+        run.advance(50)
+        paths.append(np.concatenate([run.get("state_estimated"), run.get("effort_measured")]))
+    np.testing.assert_allclose(paths[1], paths[0], atol=1e-9)
+    assert np.abs(paths[0][:7] - middle(arm)).max() > 1e-3
+
+
 @pytest.mark.parametrize("effects", [None, ArmEffects()])
 def test_controller_receives_state_before_the_step(effects):
     arm = load_arm("mtml")
     model = IdentifiedModel.from_arm(arm)
-    builder = DiagramBuilder()
-    station, controller = ArmStation(arm, effects=effects), GravityPidController(model, mode="gravity")
-    add_closed_loop(builder, station, controller)
-    simulator = Simulator(builder.Build())
-    context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
-    station.SetPositions(context, np.full(7, 0.3))
-    station.GetInputPort("mtml.effort_disturbance").FixValue(context, 0.2 * arm.effort_limits)
-    simulator.Initialize()
-    port, own = controller.GetOutputPort("effort"), controller.GetMyContextFromRoot(simulator.get_context())
+    controlled = ControlledArm(arm, np.full(7, 0.3), model, effects=effects)
+    controlled.station.GetInputPort("mtml.effort_disturbance").FixValue(controlled.context, 0.2 * arm.effort_limits)
+    controlled.simulator.Initialize()
+    port, own = controlled.controller.GetOutputPort("effort"), controlled.controller_context
     for k in range(1, 30):
-        before = station.GetPositions(context)
-        simulator.AdvanceTo(k * STEP)
-        now = station.GetPositions(context)
+        before = controlled.q
+        controlled.simulator.AdvanceTo(k * STEP)
+        now = controlled.q
         limited = [np.clip(model.holding_torque(q), -arm.effort_limits, arm.effort_limits) for q in (before, now)]
         np.testing.assert_allclose(port.Eval(own), limited[0], atol=1e-12)
     assert np.abs(limited[1] - limited[0]).max() > 1e-6

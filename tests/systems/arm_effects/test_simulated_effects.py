@@ -47,19 +47,6 @@ def test_gravity_controller_holds_arm_with_effects(name):
     assert np.all(np.abs(recording.tau) <= 1.1 * arm.effort_limits)
 
 
-def test_every_part_can_be_selected():
-    arm = load_arm("mtml")
-    for name in EFFECT_NAMES:
-        assert getattr(arm.effects, name)
-        alone, rest = arm.effects.only([name]), arm.effects.without(name)
-        for other in EFFECT_NAMES:
-            kept, dropped = (alone, rest) if other == name else (rest, alone)
-            assert getattr(kept, other) == getattr(arm.effects, other)
-            assert getattr(dropped, other) == getattr(ArmEffects(), other)
-    with pytest.raises(ArmError, match="unknown effect frction; allowed: all, friction"):
-        arm.effects.only(["frction"])
-
-
 def test_unknown_part_is_an_error(tmp_path):
     with pytest.raises(ScenarioError, match="simulated arm: unknown effect frction"):
         load_scenario("mtml", ["simulated_effects=[frction]"])

@@ -5,7 +5,6 @@ import pytest
 
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.systems.arm_view.camera import ASPECT, HALF_HEIGHT, close_up, framing, geometry_corners
-from dvrk_drake.systems.arm_view.page import start_meshcat
 
 pytestmark = pytest.mark.drake_api
 
@@ -31,10 +30,3 @@ def test_close_up_is_nearer_than_the_whole_arm():
         for links in arm.view.close_ups.values():
             near, near_target = close_up(arm, q, tuple(links))
             assert np.linalg.norm(near - near_target) < 0.6 * np.linalg.norm(camera - target)
-
-
-def test_ground_does_not_change_the_arm():
-    arm = load_arm("mtml")
-    before = arm.gravity.copy()
-    start_meshcat(arm)
-    assert np.array_equal(arm.gravity, before)

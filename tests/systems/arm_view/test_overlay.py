@@ -12,11 +12,9 @@ from dvrk_drake.errors import ArmError, DvrkDrakeError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import set_arm_positions, shared_plant
 from dvrk_drake.models.sdf_model import MODELS_FOLDER
-from dvrk_drake.reports import colours
 from dvrk_drake.systems.arm_view import page
-from dvrk_drake.systems.arm_view.drawn_arm import COMMANDED
 from dvrk_drake.systems.arm_view.efforts import LEVELS, axis_frames
-from dvrk_drake.systems.arm_view.overlay import TRACE_COLOR, ArmOverlay
+from dvrk_drake.systems.arm_view.overlay import ArmOverlay
 from dvrk_drake.systems.arm_view.page import start_meshcat
 from dvrk_drake.systems.arm_view.visibility import Visibility
 
@@ -112,12 +110,6 @@ def test_recording_stores_visibility_at_its_ends():
     visibility.set("arc", False, 1.0)
     visibility.end_recording(4.0)
     assert meshcat.changes["arc"] == [(None, False), (0.0, False), (0.5, True), (1.0, False), (4.0, False)]
-
-
-def test_colours_are_those_of_plots():
-    for color, plotted in ((COMMANDED, colours.COMMANDED), (TRACE_COLOR, colours.MEASURED)):
-        parts = [int(plotted[i : i + 2], 16) / 255 for i in (1, 3, 5)]
-        np.testing.assert_allclose([color.r(), color.g(), color.b()], parts, rtol=0, atol=5e-3)
 
 
 def test_drawing_does_not_change_a_simulation():

@@ -110,26 +110,6 @@ def test_empty_modes_accept_no_mode():
     assert bench.send(Command.EFFORT) == bench.send(Command.POSITION) == Status.REFUSAL_BAD_MODE
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("start_effort", 2.0),  # any effort would be near any other
-        ("margin", 2.0),  # any pose would be near any other
-        ("margin_fraction", 0.5),  # both walls would fill the range
-        ("effort_fraction", 1.1),
-        ("effort_rise_time", 1e-6),
-        ("traverse_time", 1e-3),
-        ("clock_tolerance", 5.0),
-        ("expiry", 1.1),
-        ("start_time", 1e-3),
-    ],
-)
-def test_settings_that_disable_the_guard_are_refused(name, value):
-    for bad in (value, 0.0, -1.0, float("nan"), float("inf")):
-        with pytest.raises(StationError, match=f"guard settings: {name} is .*; allowed: "):
-            GuardSettings(**{name: bad})
-
-
 def test_later_changes_of_settings_are_checked():
     settings = GuardSettings()
     settings.expiry = 9.0
@@ -163,7 +143,7 @@ def test_feedforward_velocity_stays_inside_limits(name):
     bench = Bench(arm).started(Command.POSITION)
     bench.follows = True
     generator = np.random.default_rng(2)
-    for q in arm.sample_poses(30, generator):
+    for q in arm.sample_poses(8, generator):
         # The motion there takes up to the traverse time.
         bench.run(Command.POSITION, 520, position=list(q))
         bench.run(Command.POSITION, 1, position=list(q), velocity=list(1e5 * generator.normal(size=arm.num_joints)))
@@ -181,19 +161,6 @@ def test_start_with_leading_velocity_is_refused():
 
 
 # Limits
-
-
-def test_efforts_inside_wall_start_without_step():
-    for side in (1, -1):
-        bench = Bench(q=[(UPPER if side > 0 else LOWER)[0], *Q[1:]])
-        bench.run(Command.EFFORT, 250)
-        last, steps = bench.effort[0], []
-        for _ in range(300):
-            bench.run(Command.EFFORT, 1)
-            steps.append(bench.output.effort[0] - last)
-            last = bench.output.effort[0]
-        assert max(np.abs(steps)) <= LIMIT[0] / 20 * (1 + 1e-9)  # the rate of efforts
-        assert last == pytest.approx(-side * LIMIT[0])
 
 
 def test_wall_next_to_start_acts_immediately():
@@ -250,16 +217,6 @@ def test_reset_outside_limits_holds_and_refuses_efforts(excess):
     assert (output.control_mode, bench.guard.state) == (Command.HOLD, Status.STATE_HOLD)
     code = bench.send(Command.EFFORT)
     assert code == (Status.REFUSAL_START_OUTSIDE if excess > 0.025 else Status.REFUSAL_NONE)
-
-
-@pytest.mark.parametrize("velocity", [1e5, -1e5])
-def test_huge_velocity_keeps_effort_limit(velocity):
-    bench = Bench().started()
-    bench.v = np.full(N, velocity)
-    output = bench.tick()
-    assert np.all(np.abs(output.effort) <= LIMIT)
-    bench.v = np.zeros(N)
-    np.testing.assert_allclose(bench.tick().effort, 0.05 * LIMIT, atol=1e-12)
 
 
 # A real arm's power

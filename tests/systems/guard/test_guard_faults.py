@@ -20,14 +20,6 @@ def test_fault_accepts_only_hold():
         assert bench.tick().control_mode == Command.HOLD
 
 
-def test_new_sender_after_silence_restarts():
-    bench = Bench(settings=GuardSettings(resume_automatically=True)).started()
-    bench.tick(51)
-    assert bench.send(sender=6) == Status.REFUSAL_NONE
-    assert bench.guard.state == Status.STATE_STARTING
-    assert bench.guard.fault_code == Status.FAULT_NONE
-
-
 def test_reset_requires_a_change_of_the_flag():
     bench = Bench(modes=WITH_OFF)
     bench.guard.report_fault("the amplifier is hot")
@@ -315,14 +307,6 @@ def test_implausible_first_pose_is_a_fault():
     bench.started()
 
 
-def test_implausible_first_pose_faults_again_after_reset():
-    bench = Bench(q=np.degrees(Q))
-    for asks in (False, True):
-        bench.send(Command.HOLD, reset_fault=asks, position=list(Q))
-        bench.tick()
-    assert (bench.guard.state, bench.output.control_mode) == (Status.STATE_FAULT, Command.OFF)
-
-
 def test_first_pose_slightly_beyond_limit_is_held():
     q = Q.copy()
     q[0] = ARM.position_upper[0] + 0.4 * (ARM.position_upper[0] - ARM.position_lower[0])
@@ -380,15 +364,6 @@ def test_jump_far_beyond_limits_cannot_be_reset():
     assert bench.guard.state == Status.STATE_FAULT
 
 
-def test_backward_measurement_time_is_a_fault():
-    bench = Bench(model=Heavy(), checks=True).at_rest().started()
-    for k in range(2 * BAD):
-        bench.age = 2 * MS * (k % 2)
-        bench.utime += MS
-        bench.step()
-    assert bench.guard.hold_reason == "the measurement is 0.001000 s older than the previous one"
-
-
 def test_efforts_require_finite_model_gravity():
     bench = Bench(model=Heavy(), checks=True).at_rest()
     bench.guard._plausibility.gravity = np.full(N, np.nan)
@@ -414,16 +389,6 @@ def test_prismatic_joint_in_millimetres_is_reported():
     assert guard.fault_text == text
 
 
-def test_off_in_fault_requires_reset():
-    bench = Bench(modes=WITH_OFF)
-    bench.guard.report_fault("the amplifier is hot")
-    bench.run(Command.HOLD, 2)
-    assert bench.send(Command.OFF) == Status.REFUSAL_FAULT
-    assert bench.tick().control_mode == Command.HOLD
-    bench.run(Command.HOLD, 1, reset_fault=True)
-    assert bench.run(Command.OFF, 1).control_mode == Command.OFF
-
-
 @pytest.mark.parametrize("mode", [Command.HOLD, Command.POSITION, Command.EFFORT])
 def test_old_measurement_is_invalid(mode):
     bench = Bench()
@@ -439,14 +404,6 @@ def test_old_measurement_is_invalid(mode):
     output = bench.tick(BAD)
     assert (output.control_mode, bench.guard.fault_code) == (Command.EFFORT, Status.FAULT_MEASUREMENT)
     assert bench.guard.fault_text == old
-
-
-def test_future_measurement_is_invalid():
-    bench = Bench().started()
-    bench.age = -1
-    assert bench.tick().control_mode == Command.HOLD
-    bench.tick(BAD)
-    assert bench.guard.fault_code == Status.FAULT_MEASUREMENT
 
 
 RANGE = ARM.position_upper - ARM.position_lower

@@ -80,16 +80,6 @@ def test_positions_are_limited_in_rate_and_range():
         assert not np.any(output.velocity)
 
 
-def test_feedforward_velocity_passes_with_unlimited_position():
-    bench = Bench().started(Command.POSITION)
-    output = bench.run(Command.POSITION, 1, velocity=[0.01] * N)
-    np.testing.assert_allclose(output.velocity, np.full(N, 0.01), atol=1e-12)
-    output = bench.run(Command.POSITION, 400, velocity=[100.0] * N)  # the change of the velocity is limited
-    # Shoulder and elbow together would reach the coupled limit, see test_guard_attacks.py.
-    free = [0, 3, 4, 5, 6]
-    np.testing.assert_allclose(output.velocity[free], bench.guard.limits.speed[free], atol=1e-12)
-
-
 def test_hold_after_position_keeps_near_target():
     bench = Bench().started(Command.POSITION)
     bench.q = Q - 0.01  # the arm sags

@@ -116,21 +116,6 @@ def test_answer_to_an_old_status_is_stale():
     assert unborn.receive(bench.command(), bench.utime) == Status.REFUSAL_STALE
 
 
-def test_order_duplicates_and_gaps_of_commands():
-    bench = Bench()
-    first = bench.command()
-    bench.tick()
-    second = bench.command()
-    bench.tick()
-    assert bench.guard.receive(second, bench.utime) == Status.REFUSAL_NONE
-    assert bench.guard.receive(second, bench.utime) == Status.REFUSAL_OUT_OF_ORDER
-    assert bench.guard.receive(first, bench.utime) == Status.REFUSAL_OUT_OF_ORDER
-    bench.sequence += 3
-    bench.tick()
-    assert bench.send() == Status.REFUSAL_NONE
-    assert bench.guard.counts.lost == 3
-
-
 @pytest.mark.parametrize("jump", [-51 * MS, -3600 * 10**6, 51 * MS, 3600 * 10**6])
 def test_sender_clock_jump_leads_to_hold_and_restart(jump):
     bench = Bench(settings=GuardSettings(resume_automatically=True)).started()
@@ -145,26 +130,3 @@ def test_sender_clock_jump_leads_to_hold_and_restart(jump):
         assert bench.guard.state in (Status.STATE_HOLD, Status.STATE_STARTING)
         assert bench.send(utime=bench.utime - 10**15 + jump) == Status.REFUSAL_NONE
     assert bench.guard.state == Status.STATE_EFFORT
-
-
-@pytest.mark.parametrize("lead", [-49 * MS, 49 * MS])
-def test_sender_clock_tolerance(lead):
-    bench = Bench()
-    bench.run(Command.HOLD, 1)
-    bench.tick(50)
-    assert bench.send(Command.HOLD, utime=bench.utime - 10**15 + lead) == Status.REFUSAL_NONE
-
-
-def test_arm_clock_jumps_expire_commands_or_fault():
-    bench = Bench(settings=GuardSettings(resume_automatically=True)).started()
-    bench.utime += 3600 * 10**6
-    assert bench.tick().control_mode == Command.HOLD
-    bench.started()
-    bench.utime -= 3600 * 10**6
-    assert bench.tick().control_mode == Command.HOLD
-    assert bench.guard.fault_code == Status.FAULT_CLOCK
-    # The reset works on the present clock.
-    bench.run(Command.HOLD, 2)
-    bench.run(Command.HOLD, 1, reset_fault=True)
-    assert bench.guard.state == Status.STATE_HOLD
-    bench.started()

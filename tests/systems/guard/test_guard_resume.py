@@ -356,14 +356,6 @@ def test_measurements_have_wall_clock_times():
     assert clock.time_of(11_999, 7) == clock.now() - 7
 
 
-def test_backward_arm_clock_discards_wall_clock_times():
-    bench = WallBench().started()
-    bench.stalled += 10**6
-    bench.utime -= 10**6
-    bench.step()
-    assert bench.guard._expiry.wall.time_of(bench.utime + 10**6 - MS, 7) == bench.guard._expiry.wall.now() - 7
-
-
 def test_stall_while_starting_needs_no_resume():
     bench = WallBench()
     bench.run(Command.EFFORT, 200)

@@ -256,15 +256,6 @@ def test_joints_stop_together_on_coupled_limit(side):
         np.testing.assert_allclose(moved, on, atol=1e-9)
 
 
-def test_target_outside_moves_only_inward():
-    last = Q.copy()
-    last[5] = UPPER[5] + 0.1
-    out, flags = LIMITS.limit_position(last + 0.01 * E[5], last, 0.1)
-    assert out[5] == last[5] and flags[5] & Status.FLAG_POSITION_LIMIT
-    back, flags = LIMITS.limit_position(last - 0.01 * E[5], last, 0.1)
-    assert back[5] == pytest.approx(last[5] - 0.01) and not np.any(flags)
-
-
 def coupled(*limits):
     """Returns the arm with other coupled limits. Joints differ in effort and in Kd/Kp."""
     gains = dataclasses.replace(ARM.gains, kd=list(KP * np.linspace(0.05, 0.2, N)))

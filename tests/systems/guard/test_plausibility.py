@@ -238,14 +238,6 @@ def test_motion_inconsistent_with_effort_is_found(joint):
         assert sensors.checks.invalid[joint] == found
 
 
-def test_mass_matrix_is_updated_every_50_ms():
-    model = Unity()
-    poses = []
-    model.mass_matrix = lambda q: (poses.append(q), np.eye(N))[1]
-    Sensors(model=model).move(np.zeros(N), ticks=1000)
-    assert 15 <= len(poses) <= 25
-
-
 def test_slowly_growing_model_error_is_accepted():
     sensors = Sensors()
     v = COUNTS / MS  # one count per tick, so that the position is not frozen

@@ -47,10 +47,3 @@ def test_motors_get_power_only_by_hold_or_reset():
     for state, event, next_state in rows():
         if not state.is_powered and next_state.is_powered:
             assert event in (Event.HOLD, Event.RESET) and next_state is State.HOLD
-
-
-def test_events_lead_to_their_states():
-    assert after(Event.OFF) == {Status.STATE_OFF}
-    assert after(Event.START) == {Status.STATE_STARTING}
-    assert after(Event.HOLD) == after(Event.WATCHDOG) == {Status.STATE_HOLD}
-    assert all(after(event) == {Status.STATE_FAULT} for event in (Event.FAULT, Event.UNSAFE_LOOP, Event.POWER_LOSS))

@@ -3,12 +3,10 @@
 import numpy as np
 import pytest
 from lcm_arm import ARM, POSES, START, CommandSender, Controller, SimulatedArm, run
-from pydrake.common.yaml import yaml_load_typed
 from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 
 from dvrk_drake.dynamics.identified_model import ControlModel, IdentifiedModel
-from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.lcm_messages import create_key_file
@@ -320,35 +318,6 @@ def test_hardware_station_ignores_old_statuses():
             station.GetMyContextFromRoot(controller.simulator.get_context())
         )
         np.testing.assert_allclose(q, POSES["mtml"], atol=1e-3)
-
-
-def test_each_context_has_its_own_guard():
-    lcm = DrakeLcm("memq://")
-    arm, controller = SimulatedArm(lcm), Controller(lcm)
-    run(lcm, 300, arm, controller)
-    simulator = arm.simulator
-    clone = simulator.get_context().Clone()
-    driver = simulator.get_system().GetSubsystemByName("mtml_driver")
-    guard = driver.GetGuard(driver.GetMyContextFromRoot(clone))
-    run(lcm, 100, arm)
-    assert guard.state == Status.STATE_EFFORT
-    assert driver.GetGuard(driver.GetMyContextFromRoot(simulator.get_context())).state == Status.STATE_HOLD
-    assert guard.counts.expired == 0
-
-
-def test_driver_is_loaded_from_yaml_and_checked():
-    driver = yaml_load_typed(
-        schema=DvrkDriver, data="{status_period: 0.002, guard: {expiry: 0.02}}", defaults=DvrkDriver()
-    )
-    assert (driver.status_period, driver.guard.expiry, driver.guard.start_time) == (0.002, 0.02, 0.25)
-    with pytest.raises(StationError, match="unknown mode: \\['speed'\\]; allowed: position, effort, off"):
-        DvrkDriver(control_modes=["speed"])
-    with pytest.raises(StationError, match="status_period"):
-        DvrkDriver(status_period=0.0)
-    with pytest.raises(StationError, match=r"expiry is 5; allowed: 0\.002\.\.1 s"):
-        DvrkDriver(guard=type(driver.guard)(expiry=5.0))
-    with pytest.raises(StationError, match=r"margin is .*; allowed: 0\.001\.\.0\.3"):
-        type(driver.guard)(margin=float("nan"))
 
 
 def test_messages_require_the_same_key(tmp_path):

@@ -90,15 +90,6 @@ def test_answer_is_stepped_at_most_once_per_measurement(bench):
     assert bench.status.num_accepted + bench.status.num_refused >= before + 4
 
 
-def test_update_returns_whether_it_answered(bench):
-    assert not bench.ready().bridge.is_commanded
-    assert bench.started().bridge.is_commanded
-    bench.tick()
-    bench.bridge.put(bench.command())
-    # A bridge that polls spins until this answer, and pauses after it.
-    assert [bench.bridge.update(), bench.bridge.update()] == [True, False]
-
-
 def test_unanswered_efforts_are_published_one_period_later(bench):
     bench.started().clear()
     bench.tick()
@@ -253,13 +244,6 @@ def test_gravity_compensation_of_a_psm_is_not_required(monkeypatch):
     bench = CrtkBench(monkeypatch, "psm")
     bench.client.gravity_after_switch = None
     assert allows_efforts(bench.ready())
-
-
-def test_gravity_compensation_is_switched_off_once(bench):
-    bench.started()
-    assert bench.sent.count(("use_gravity_compensation", False)) == 1
-    assert ("use_gravity_compensation", True) not in bench.sent
-    assert bench.lines.count(HOME) == 1
 
 
 def test_jaw_is_commanded_on_change_only_and_before_the_arm(monkeypatch):

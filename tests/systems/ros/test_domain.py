@@ -18,7 +18,6 @@ from ros_publisher import DOMAIN_FILE
 from waiting import TIMEOUT, wait_until
 
 from dvrk_drake.errors import DvrkDrakeError
-from dvrk_drake.systems.ros.open_domain import open_ros_domain
 
 module = pytest.importorskip("dvrk_drake.systems.ros.domain", reason="needs cyclonedds")
 messages = pytest.importorskip("dvrk_drake.systems.ros.messages", reason="needs cyclonedds")
@@ -344,17 +343,6 @@ def test_bytes_on_the_network_end_with_zeros(domain, arm):
         assert encoded + bytes(-len(encoded) % 4) in captured
         if len(encoded) % 4:
             assert encoded not in captured
-
-
-@pytest.mark.parametrize("value", ["-1", "233", "1.0", "one"])
-def test_invalid_domain_is_refused(value, monkeypatch):
-    monkeypatch.setenv("ROS_DOMAIN_ID", value)
-    with pytest.raises(module.DvrkDrakeError, match=f"ROS domain {value}: allowed: 0 to 232"):
-        open_ros_domain()
-
-
-def test_configuration_of_the_user_is_kept(domain):
-    assert os.environ["CYCLONEDDS_URI"] == DOMAIN_FILE
 
 
 def test_lost_network_prints_nothing(monkeypatch, capfd):

@@ -116,31 +116,6 @@ def test_efforts_act_on_the_arm(name):
     assert simulated.q[0] > q[0] + 1e-3
 
 
-def test_gravity_effort_does_the_work_of_gravity():
-    """A slow motion against gravity: the work of the motors is the change of the potential energy."""
-    simulated = Simulated("mtml")
-    q = simulated.home()
-    plant = simulated.station.plant
-    context = simulated.station.GetMyContextFromRoot(simulated.context)
-
-    def potential():
-        return plant.CalcPotentialEnergy(simulated.station.GetSubsystemContext(plant, context))
-
-    goal, work = q.copy(), 0.0
-    goal[1:3] += [0.2, -0.1]
-    before, last = potential(), simulated.q
-    simulated.send("move_jp", goal, seconds=1e-3)
-    while simulated.machine.is_busy or np.max(np.abs(simulated.q - goal)) > 2e-3:
-        effort = simulated.effort
-        simulated.wait(1e-3)
-        now = simulated.q
-        work += effort @ (now - last)
-        last = now
-    change = potential() - before
-    assert abs(change) > 0.05
-    assert work == pytest.approx(change, rel=0.02)
-
-
 def test_jaw_has_a_control_mode_of_its_own():
     simulated = Simulated("psm")
     q = simulated.home()
@@ -196,17 +171,3 @@ def test_driver_file(tmp_path):
     driver.relative_to(tmp_path)
     with pytest.raises(ModelError, match=str(tmp_path / "model.yaml")):
         driver.load_model(load_arm("mtml"))
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"domain": 233}, r"domain is 233; allowed: 0\.\.232"),
-        ({"rate": 1e4}, r"rate is 10000; allowed: 10\.\.1000 Hz"),
-        ({"namespace": "MTM L"}, 'namespace is "MTM L"; allowed: names of letters, digits and underscores'),
-        ({"namespace": "lab//MTML"}, 'namespace is "lab//MTML"; allowed: '),
-    ],
-)
-def test_invalid_driver_is_refused(options, message):
-    with pytest.raises(StationError, match=message):
-        CrtkDriver(**options)
