@@ -2,35 +2,27 @@
 
 import copy
 import dataclasses
-from collections import Counter
 
 import numpy as np
 import pytest
 from command_output import refusal
 from motions import fourier_motion, friction_everywhere, recorded, true_dynamics
 from recordings import csv_block
-from report_pages import printed
 
 from dvrk_drake.analysis.motion_identification import identify_dynamic, motion_problem
 from dvrk_drake.analysis.motion_validation import predict_motion, validate_motion
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.validation import predict
 from dvrk_drake.cli import main
-from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.dynamic_regressor import derive_base_parameters
 from dvrk_drake.dynamics.gravity_parameters import gravity_parameters
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import pseudo_inertia
 from dvrk_drake.errors import ModelError, RecordingError
-from dvrk_drake.models import plant
-from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import DriveEffect
-from dvrk_drake.models.linear_map import LinearMap
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.recordings.writing import write_recording
-from dvrk_drake.reports.identification import identification_page
-from dvrk_drake.reports.terminal import TABLE_WIDTH
 
 pytestmark = pytest.mark.numeric
 
@@ -135,16 +127,6 @@ def test_base_parameters_of_the_motion_lie_in_their_intervals(case):
     assert all(0 <= p.identifiability <= 1 for p in found) and min(p.identifiability for p in found) < 0.2
 
 
-def test_every_parameter_is_printed_on_request(case):
-    _, _, _, result = case
-    page, section = identification_page(result), result.model.dynamics
-    assert max(map(len, printed(page, verbose=True).splitlines())) <= TABLE_WIDTH
-    text = printed(page, verbose=True, columns=400)
-    folded = "".join(text.split())
-    assert all("".join(p.name.split()) in folded for p in section.base_parameters)
-    assert all(link.link in text for link in section.links)
-
-
 def test_true_friction_is_found(case):
     arm, truth, _, result = case
     _, q, v, vd = fourier_motion(arm, np.random.default_rng(2), 9.0, 9.0, RATE)
@@ -191,34 +173,12 @@ def test_friction_without_information_is_not_estimated(case):
     assert problem.num_mandatory + len(problem.candidates) == problem.num_effects == problem.columns.rows.shape[0]
 
 
-def test_loads_of_a_subset_are_those_of_the_motion(case):
-    arm, _, recording, _ = case
-    effects = [ActuatorEffect(f"actuator.{arm.joint_names[1]}", "load coulomb", 0.1)]
-    problem = motion_problem([Observations(recording, arm)], effects)
-    rows = np.arange(problem.num_rows) % 3 == 0
-    loaded = problem.with_load(1.3 * problem.prior, np.arange(1), np.ones(1))
-    subset = problem.subset(rows).with_load(1.3 * problem.prior, np.arange(1), np.ones(1))
-    assert not np.allclose(loaded.columns.shapes[1], problem.columns.shapes[1], rtol=0, atol=1e-6)
-    np.testing.assert_allclose(subset.columns.shapes[1], loaded.columns.shapes[1][rows], rtol=0, atol=1e-12)
-    # The load is proportional to the link parameters.
-    np.testing.assert_allclose(loaded.columns.shapes[1], 1.3 * problem.columns.shapes[1], rtol=0, atol=1e-9)
-
-
 def test_links_are_consistent_and_energy_is_positive(case):
     arm, _, _, result = case
     assert min(np.linalg.eigvalsh(pseudo_inertia(link.parameters))[0] for link in result.model.dynamics.links) > 0
     M = result.model.dynamic_model.mass_matrix(arm.sample_poses(300, np.random.default_rng(3)))
     np.testing.assert_allclose(M, np.swapaxes(M, 1, 2), atol=1e-12)
     assert np.min(np.linalg.eigvalsh(M)) > 0
-
-
-def test_links_and_base_parameters_give_equal_holding_torques(case):
-    arm, _, _, result = case
-    model = result.model.dynamic_model
-    q = arm.sample_poses(50, np.random.default_rng(4))
-    beta = [p.value for p in result.model.base_parameters]
-    tau = result.model.static_model.regressor(q)[:, :, : len(beta)] @ beta
-    np.testing.assert_allclose(tau, model.regressor.torque(q, 0 * q, 0 * q, model.parameters), atol=1e-9)
 
 
 def test_model_file_round_trip(case, tmp_path):
@@ -286,39 +246,6 @@ def test_motion_without_efforts_is_predicted_not_validated(case, tmp_path, capsy
     np.testing.assert_allclose(powers[1], powers[0], rtol=0, atol=1e-9 * np.abs(powers[0]).max())
     assert main(["validate", paths["without.csv"], "--model", paths["model.yaml"]]) == 2
     assert "has no efforts; needs columns tau1..tau7" in capsys.readouterr().err
-
-
-def test_actuator_coordinates_give_the_same_dynamic_model(case):
-    arm, _, recording, result = case
-    mirrored = recording.in_actuator_coordinates(arm)
-    a, b = (validate_motion(result.model, Observations.for_model(r, result.model)) for r in (recording, mirrored))
-    np.testing.assert_allclose(
-        [x.relative_error for x in a.actuators], [x.relative_error for x in b.actuators], rtol=1e-6, atol=0
-    )
-
-
-def test_plants_and_conversions_are_computed_once(case, monkeypatch):
-    """One plant for each mounting: nominal, and estimated from the motion."""
-    arm, _, recording, _ = case
-    made = Counter()
-
-    def counted(name, function):
-        def count(*arguments, **options):
-            made[name] += 1
-            return function(*arguments, **options)
-
-        return count
-
-    new = dataclasses.replace(arm, transmission=LinearMap(arm.transmission.matrix, arm.transmission.offset))
-    monkeypatch.setattr(plant, "make_arm_plant", counted("plants", plant.make_arm_plant))
-    monkeypatch.setattr(LinearMap.inverse, "func", counted("inverses", LinearMap.inverse.func))
-    monkeypatch.setattr(Arm.effect_coordinates, "func", counted("coordinates", Arm.effect_coordinates.func))
-    identify_dynamic([Observations(dataclasses.replace(recording), new)])
-    assert made["inverses"] == 1
-    assert 1 <= made["plants"] <= 2
-    assert 1 <= made["coordinates"] <= 2
-    assert recording.in_actuator_coordinates(arm) is recording.in_actuator_coordinates(arm)
-    assert recording.in_actuator_coordinates(arm).in_joint_coordinates(arm) is recording
 
 
 def test_recordings_that_are_not_motions_are_rejected():

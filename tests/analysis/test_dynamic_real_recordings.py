@@ -5,13 +5,11 @@ Published errors on another motion of these arms (Wang et al., RA-L 2019, recomp
 """
 
 import dataclasses
-import json
 from contextlib import redirect_stdout
 from io import StringIO
 
 import numpy as np
 import pytest
-from recordings import csv_block
 
 from dvrk_drake.analysis.effects_at_rest import with_effects_at_rest
 from dvrk_drake.analysis.motion_validation import validate_motion
@@ -20,7 +18,6 @@ from dvrk_drake.analysis.pose_identification import identify_static
 from dvrk_drake.analysis.recalibration import refit_friction
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.dynamics.inertial_parameters import pseudo_inertia
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import Recording
@@ -74,36 +71,12 @@ def test_repeatability_floor_matches_the_data(case):
     np.testing.assert_allclose(percent(model, "rms_repeatability"), FLOOR[name], atol=0.15)
 
 
-def test_identified_arm_is_consistent_and_can_be_simulated(case):
-    _, arm, _, model, _ = case
-    assert min(np.linalg.eigvalsh(pseudo_inertia(link.parameters))[0] for link in model.dynamics.links) > 0
-    M = model.dynamic_model.mass_matrix(arm.sample_poses(300, np.random.default_rng(0)))
-    assert np.min(np.linalg.eigvalsh(M)) > 0
-
-
 def test_validation_reproduces_the_fit_error(case):
     _, _, recording, model, _ = case
     validation = validate_motion(model, Observations.for_model(recording, model))
     # The fit is linear in the tilt, and the model omits negligible effects.
     fitted = percent(model, "rms_fit")
     np.testing.assert_allclose([100 * a.relative_error for a in validation.actuators], fitted, rtol=0.02, atol=0)
-
-
-def test_commands_accept_a_real_motion(case, tmp_path):
-    name, arm, recording, _, folder = case
-    path, model = folder / "motion.csv", folder / "model.yaml"
-    errors, tau = tmp_path / "errors.json", tmp_path / "tau.csv"
-    assert {p.name for p in (folder / "plots").iterdir()} >= {"efforts.png", "residuals.png", "error_budget.png"}
-    assert main(["validate", str(path), "--model", str(model), "--json", str(errors)]) == 0
-    found = json.loads(errors.read_text())
-    assert found["coordinates"] == "actuator" and found["mean_relative_error"] < TARGET[name] / 100
-    assert main(["predict", str(path), "--model", str(model), "--output", str(tau)]) == 0
-    joints, lower, upper = (csv_block(tau, name) for name in ("tau", "lower", "upper"))
-    np.testing.assert_allclose(upper - joints, joints - lower, rtol=0, atol=1e-9)
-    predicted = arm.transmission.inverse.pull_back_effort(joints)
-    measured = recording.in_actuator_coordinates(arm).tau
-    ratio = np.linalg.norm((predicted - measured)[200:-200], axis=0) / np.linalg.norm(measured[200:-200], axis=0)
-    assert np.all(ratio < 1)
 
 
 def test_holding_effects_do_not_increase_static_errors(case, shared_data):

@@ -14,7 +14,6 @@ from dvrk_drake.dynamics.actuator_effects import (
     effect_fault,
     is_prismatic,
     joint_row,
-    position_along,
 )
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.holding_torque import holding_torque_into
@@ -149,11 +148,3 @@ def test_identical_coordinates_are_listed_once(name):
     assert [c for c in rows if is_prismatic(arm, c)] == [f"{kind}.insertion" for kind in ("actuator", "joint")] * (
         name == "psm"
     )
-
-
-def test_work_along_a_coordinate_equals_work_on_the_joints():
-    arm, generator = load_arm("psm"), np.random.default_rng(5)
-    q, dq = generator.normal(size=(2, 1, arm.num_joints))
-    for coordinate in arm.effect_coordinates:
-        dx = position_along(arm, coordinate, q + dq) - position_along(arm, coordinate, q)
-        assert dx[0] == pytest.approx(float(dq[0] @ joint_row(arm, coordinate)), abs=1e-12)

@@ -22,13 +22,11 @@ from dvrk_drake.analysis.payload import (
 )
 from dvrk_drake.analysis.payload import payload as estimate
 from dvrk_drake.cli import main
-from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.dynamics.inertial_parameters import LinkInertia, link_inertias, pseudo_inertia
+from dvrk_drake.dynamics.inertial_parameters import LinkInertia, link_inertias
 from dvrk_drake.errors import ModelError, RecordingError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import inverse_dynamics as plant_inverse_dynamics
-from dvrk_drake.models.plant import make_arm_plant
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.recordings.writing import write_recording
@@ -60,29 +58,6 @@ def inverse_dynamics(arm, plant, context, q, v, vd):
     forces = MultibodyForces(plant)
     plant.CalcForceElementsContribution(context, forces)
     return arm.linkage.pull_back_effort(plant.CalcInverseDynamics(context, tree[2], forces)[order])
-
-
-@pytest.mark.parametrize("case", CASES)
-def test_point_mass_equals_a_drake_body(case):
-    name, link, mass, position = CASES[case]
-    arm, plant = load_arm(name), make_arm_plant(load_arm(name))
-    regressor, generator = DynamicRegressor(arm), np.random.default_rng(0)
-    names = [own.link for own in regressor.links]
-    k, added = names.index(link), point_mass_parameters(mass, np.array(position))
-    context = plant.CreateDefaultContext()
-    q = arm.sample_poses(5, generator)
-    v, vd = generator.normal(size=(2, *q.shape))
-    before = [inverse_dynamics(arm, plant, context, *sample) for sample in zip(q, v, vd, strict=True)]
-    loaded = LinkInertia(link, regressor.links[k].parameters + added).to_spatial_inertia()
-    plant.GetBodyByName(link).SetSpatialInertiaInBodyFrame(context, loaded)
-    after = [inverse_dynamics(arm, plant, context, *sample) for sample in zip(q, v, vd, strict=True)]
-    change = regressor.regressor(q, v, vd)[..., 10 * k : 10 * k + 10] @ added
-    np.testing.assert_allclose(change, np.subtract(after, before), atol=1e-10)
-
-
-def test_point_mass_has_a_singular_pseudo_inertia():
-    values = np.linalg.eigvalsh(pseudo_inertia(point_mass_parameters(0.2, np.array([0.1, -0.3, 0.2]))))
-    assert values[:3] == pytest.approx(0, abs=1e-12) and values[3] > 0.1
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -304,14 +279,6 @@ def test_known_weights_without_reference(unloaded, file, link, mass, height):
     assert payload.found
     assert abs(payload.body.mass - mass) < payload.quantile * payload.mass_error < 0.5 * mass
     assert abs(payload.position_in_base[2] - height) < payload.quantile * payload.position_error[2]
-
-
-def test_reports_a_real_payload_on_another_link(unloaded):
-    folder, reference, model = unloaded
-    loaded = read_recording(folder / "psm_one_205g_insertion.csv", model.arm, "actuator")
-    assert_end_link_explains(
-        point_masses(reference, loaded, model, LINKS),
-    )
 
 
 @pytest.mark.slow

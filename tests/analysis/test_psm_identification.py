@@ -1,11 +1,8 @@
 """Static identification of a PSM: closed-loop plant, collected poses, identified model, command line."""
 
-import json
-
 import numpy as np
 import pytest
 from command_output import refusal
-from recordings import csv_block
 
 from dvrk_drake.analysis.pose_identification import identify_static
 from dvrk_drake.cli import main
@@ -78,31 +75,6 @@ def test_true_torque_is_identified_with_the_closed_linkage(arm, ground_truth_arm
     assert found >= {"joint.yaw offset", "joint.roll cable sine 1"}
     # At a yaw joint the torques of a spring and of a lifted weight are equal. Only one of them may be a candidate.
     assert "joint.yaw cable sine 1" not in found
-
-
-@pytest.mark.slow
-def test_commands_accept_a_psm(arm, recording, tmp_path, capsys):
-    poses, model, prediction, errors = (tmp_path / n for n in ("poses.csv", "model.yaml", "tau.csv", "errors.json"))
-    write_recording(recording, poses)
-    assert (
-        main(["identify", str(poses), "--arm", "psm", "--output", str(model), "--plots", str(tmp_path / "plots")]) == 0
-    )
-    assert "insertion" in capsys.readouterr().out
-    assert main(["validate", str(poses), "--model", str(model), "--json", str(errors)]) == 0
-    assert all(j["rms_error"] <= j["rms_torque"] + 1e-9 for j in json.loads(errors.read_text())["joints"])
-    assert main(["predict", str(poses), "--model", str(model), "--output", str(prediction)]) == 0
-    tau = csv_block(prediction, "tau")
-    np.testing.assert_allclose(tau, IdentifiedModel.load(model).holding_torque(recording.q), atol=1e-12)
-
-
-def test_long_parameter_names_keep_all_digits(capsys):
-    assert main(["equations", "--arm", "psm"]) == 0
-    text = capsys.readouterr().out
-    assert "…" not in text
-    assert "(m3+...+m6+m_finger_1+m_finger_2)" in text and "- m_counterweight" in text
-    assert main(["equations", "--arm", "psm", "--format", "latex"]) == 0
-    text = capsys.readouterr().out
-    assert "s_{6 - 7 / 2}" in text and "10^{-1" not in text
 
 
 @pytest.mark.parametrize(

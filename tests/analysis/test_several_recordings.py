@@ -5,7 +5,6 @@ import itertools
 
 import numpy as np
 import pytest
-from command_output import refusal
 from motions import fourier_motion, friction_everywhere, recorded, true_dynamics
 
 import dvrk_drake as dvrk
@@ -15,7 +14,6 @@ from dvrk_drake.analysis.motion_identification import thinned
 from dvrk_drake.analysis.motion_validation import validate_motion
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.pose_identification import identify_static
-from dvrk_drake.cli import main
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_regressor import derive_base_parameters
@@ -132,28 +130,6 @@ def test_provenance_names_all_recordings(pair):
     assert days.format("new.csv") in model.recalibrated(model.dynamics, "new.csv").interval_scope
     assert dvrk.validate(model, recordings[1]).of_same_recording
     assert not dvrk.validate(model, recordings[2]).of_same_recording
-
-
-@pytest.mark.slow
-def test_command_prints_the_error_of_each_recording(days, tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    for name, recording in zip("abc", days[2], strict=True):
-        write_recording(recording, f"{name}.csv", ARM)
-    arguments = ["--arm", "psm", "--output", "model.yaml", "--report", "report.html", "--plots", "plots"]
-    assert main(["identify", "a.csv", "b.csv", *arguments]) == 0
-    text = capsys.readouterr().out
-    assert "2 recordings, 6000 rows" in text and "predicted by a model of the others" in text
-    assert "a.csv" in text and "b.csv" in text
-    page = (tmp_path / "report.html").read_text()
-    assert "Residuals: a.csv" in page and "Measured and predicted efforts: b.csv" in page
-    assert (tmp_path / "plots/efforts.png").exists() and (tmp_path / "plots/efforts_2.png").exists()
-    assert main(["validate", "b.csv", "--model", "model.yaml", "--save"]) == 2
-    assert "identified from this recording" in refusal(capsys.readouterr().err)
-    assert main(["identify", "a.csv", "a.csv", "--arm", "psm", "--output", "twice.yaml"]) == 2
-    assert (
-        "contains the same efforts as a.csv" in refusal(capsys.readouterr().err)
-        and not (tmp_path / "twice.yaml").exists()
-    )
 
 
 def still(truth, offsets, seed):

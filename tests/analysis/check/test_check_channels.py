@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from check_findings import ARMS, changed, found
-from synthetic_motion import RATE, clean_motion
+from synthetic_motion import clean_motion
 
 from dvrk_drake.analysis.check.recording_check import check_recording
 from dvrk_drake.analysis.observations.excluded_measurements import check_effort_unit
-from dvrk_drake.analysis.observations.low_pass import low_pass
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm_files import load_arm
@@ -36,18 +35,6 @@ def test_detects_velocities_that_are_always_zero():
 
 
 @pytest.mark.parametrize("name", ARMS)
-@pytest.mark.parametrize("lag", [0.010, -0.010, 0.020])
-def test_detects_the_lag_of_efforts(name, lag):
-    report = check_recording(Observations(clean_motion(name, effort_lag=lag), load_arm(name)))
-    lags = [joint.effort_lag for joint in report.joints]
-    assert sum(value is not None for value in lags) >= 5
-    for value in lags:
-        if value is not None:
-            # The fit does not contain pose-dependent inertia, which can cause a lag error of about 3 ms.
-            assert value == pytest.approx(lag, abs=0.0035)
-
-
-@pytest.mark.parametrize("name", ARMS)
 @pytest.mark.parametrize("joint", range(7))
 def test_refuses_an_effort_with_the_wrong_sign(name, joint):
     arm = load_arm(name)
@@ -55,29 +42,6 @@ def test_refuses_an_effort_with_the_wrong_sign(name, joint):
     refusals = found(changed(motors, "tau", joint, lambda x: -x), name)["effort sign"]
     assert [f.joints for f in refusals] == [(joint,)]
     assert refusals[0].severity == "refusal"
-
-
-def test_detects_narrow_band_noise():
-    generator = np.random.default_rng(6)
-    whole = clean_motion()
-    white = generator.normal(size=len(whole))
-    band = low_pass(white, RATE, 15.0) - low_pass(white, RATE, 7.0)
-    size = 0.15 * np.sqrt(np.mean(whole.tau[:, 2] ** 2))
-    noisy = changed(whole, "tau", 2, lambda x: x + size * band / np.std(band))
-    bands = found(noisy)["narrow-band noise"]
-    assert [f.joints for f in bands] == [(2,)]
-    assert bands[0].size == pytest.approx(0.15, rel=0.15)
-
-
-def test_larger_noise_lowers_the_cut_off():
-    """The motion has no frequencies above 0.83 Hz. Only friction has higher frequencies."""
-    report = check_recording(Observations(clean_motion(), load_arm("psm")))
-    louder = changed(
-        clean_motion(), "tau", 0, lambda x: x + np.random.default_rng(8).normal(size=len(x)) * 0.5 * np.std(x)
-    )
-    noisy = check_recording(Observations(louder, load_arm("psm")))
-    assert noisy.joints[0].effort_cut_off < report.joints[0].effort_cut_off
-    assert 2.0 <= noisy.joints[0].effort_cut_off < 10.0
 
 
 def test_detects_a_saturated_effort():

@@ -13,36 +13,6 @@ from dvrk_drake.models.arm_files import load_arm
 pytestmark = pytest.mark.slow
 
 
-def test_counts_and_omits_repeated_rows():
-    generator = np.random.default_rng(3)
-    whole = clean_motion()
-    rows = np.arange(len(whole))
-    repeats = generator.random(len(rows)) < 0.12
-    repeats[0] = False
-    last = np.maximum.accumulate(np.where(repeats, 0, rows))
-    polled = replace(whole, q=whole.q[last], qd=whole.qd[last], tau=whole.tau[last])
-    kinds = found(polled)
-    assert kinds["repeated rows"][0].size == pytest.approx(np.mean(repeats), abs=1e-9)
-    clock = true_time(polled.in_actuator_coordinates(load_arm("psm")))
-    np.testing.assert_array_equal(clock.rows, rows[~repeats])
-
-
-@pytest.mark.parametrize("name", ARMS)
-@pytest.mark.parametrize("jitter", [0.15, 0.5])
-def test_estimates_and_removes_jitter(name, jitter):
-    intervals = np.random.default_rng(4).gamma(1 / jitter**2, jitter**2 / RATE, 4000)
-    true = np.concatenate([[0.0], np.cumsum(intervals)])
-    recording = clean_motion(name, at=true)
-    arm = load_arm(name)
-    kinds = found(recording, name)
-    assert kinds["jitter"][0].size == pytest.approx(jitter, rel=0.15)
-    assert "velocity disagrees" not in kinds
-    reconstructed = np.diff(true_time(recording.in_actuator_coordinates(arm)).t)
-    error = reconstructed / reconstructed.mean() - intervals / intervals.mean()
-    # The remaining error is due to the acceleration between two rows.
-    assert np.std(error) < 0.1 * jitter
-
-
 def test_detects_a_slower_effort_topic():
     whole = clean_motion()
     every_other = np.arange(len(whole)) // 2 * 2

@@ -5,12 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dvrk_drake.analysis.check import channel_check
-from dvrk_drake.analysis.check.channel_check import MIN_MIRROR_GAIN
 from dvrk_drake.analysis.check.channel_fit import ChannelFit
 from dvrk_drake.analysis.check.recording_check import check_recording, with_power
 from dvrk_drake.analysis.identification import identify
-from dvrk_drake.analysis.observations.finding import Finding
 from dvrk_drake.analysis.observations.motion_faults import jump_fault, source_fault, time_fault
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.validation import predict
@@ -308,12 +305,3 @@ def test_gain_at_rest_does_not_grow_with_the_number_of_poses():
         fit = ChannelFit(Observations(Recording(q, tau), ARM))
         gains.append(fit.gain(np.diag(np.where(np.arange(7) == 2, -1.0, 1.0))))
     assert gains[1] == pytest.approx(gains[0], rel=0.02)
-
-
-@pytest.mark.parametrize("segments", [1, 4])
-def test_gain_does_not_grow_with_the_length(segments):
-    """Repetitions of a motion have the same errors of the arm model, so they are no further evidence."""
-    almost = Finding("refusal", "inverted channel", "pitch", "inverted", "", (1,), 0.4 * MIN_MIRROR_GAIN)
-    assert channel_check._best_hypothesis([[almost]] * segments) == []
-    (found,) = channel_check._best_hypothesis([[replace(almost, size=1.1 * MIN_MIRROR_GAIN)]] * segments)
-    assert found.size == pytest.approx(1.1 * MIN_MIRROR_GAIN)

@@ -8,21 +8,13 @@ import pytest
 from check_findings import ARMS, changed, found
 from command_output import refusal
 from figure_rules import checked_figures
-from synthetic_motion import EFFORT_NOISE, PERIOD, RATE, clean_motion
+from synthetic_motion import PERIOD, clean_motion
 
-from dvrk_drake.analysis.check.effort_lag import EffortLag
-from dvrk_drake.analysis.check.motion_check import _lags
 from dvrk_drake.analysis.check.recording_check import check_recording
-from dvrk_drake.analysis.observations.low_pass import low_pass
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.cli import main
-from dvrk_drake.errors import RecordingError
-from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.models.lcm_messages import status_channel
 from dvrk_drake.models.plant import holding_torques
-from dvrk_drake.recordings.reader_lcm import LcmEvent, event_bytes
-from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import MIN_ROWS, Recording
 from dvrk_drake.recordings.writing import write_recording
 
@@ -39,16 +31,6 @@ def test_clean_motion_has_only_the_period_as_finding(name):
     for joint in report.joints:
         assert joint.velocity_gain == pytest.approx(1, abs=2e-3)
         assert joint.velocity_lag == pytest.approx(0, abs=1e-4)
-
-
-@pytest.mark.parametrize("name", ARMS)
-def test_floor_equals_the_simulated_noise(name):
-    arm = load_arm(name)
-    report = check_recording(Observations(clean_motion(name), arm))
-    white = np.random.default_rng(0).normal(size=(20000, 1)) * EFFORT_NOISE
-    passed = float(np.std(low_pass(white, RATE, arm.identification.effort_cut_off)))
-    # The noise of coupled joints adds up in actuator coordinates. The first joint has its own motor.
-    assert report.joints[0].floor == pytest.approx(passed, rel=0.15)
 
 
 @pytest.mark.parametrize("name", ARMS)
@@ -123,17 +105,6 @@ def test_poses_have_no_signals():
     assert report.joints[1].velocity_gain is None
 
 
-def test_refuses_poses_with_inverted_efforts():
-    arm = load_arm("mtml")
-    recording = poses(arm)
-    kinds = found(replace(recording, tau=-recording.tau), "mtml")
-    assert {1, 2} <= {f.joints[0] for f in kinds["effort sign"]}
-
-
-def test_warns_of_few_poses():
-    assert found(replace(poses(load_arm("mtml"), 5)), "mtml")["few poses"][0].size == 5
-
-
 def test_warns_of_a_motion_without_times():
     motion = clean_motion("psm")
     rows = replace(motion, t=None, qd=None)
@@ -171,27 +142,6 @@ def test_arm_at_rest_without_efforts():
     assert set(found(still)) == {"never moves", "no effort", "no repetition"}
 
 
-def test_lcm_log(tmp_path):
-    arm, whole = load_arm("psm"), clean_motion()
-    events = []
-    for row in range(len(whole)):
-        status = Status()
-        status.utime, status.sequence, status.session_id = 1 + round(1e6 * whole.t[row]), row, 1
-        status.arm_name, status.num_joints, status.guard_state = arm.name, arm.num_joints, Status.STATE_HOLD
-        status.position, status.velocity = whole.q[row].tolist(), whole.qd[row].tolist()
-        status.effort_measured, status.joint_flags = whole.tau[row].tolist(), [0] * arm.num_joints
-        status.position_commanded, status.effort_commanded = status.position, status.effort_measured
-        events.append(event_bytes(LcmEvent(row, status.utime, status_channel(arm), status.encode())))
-    (tmp_path / "arm.log").write_bytes(b"".join(events))
-    report = check_recording(Observations(read_recording(tmp_path / "arm.log", arm), arm))
-    assert report.kind == "motion"
-    assert [finding.kind for finding in report.findings] == ["repetition"]
-    assert report.period == pytest.approx(PERIOD, abs=1e-3)
-    (tmp_path / "cut.log").write_bytes(b"".join(events)[:-10])
-    report = check_recording(Observations(read_recording(tmp_path / "cut.log", arm), arm))
-    assert {finding.kind for finding in report.findings} == {"reading", "repetition"}
-
-
 def test_command_prints_findings_and_writes_json(tmp_path, capsys, monkeypatch):
     path, output = tmp_path / "motion.csv", tmp_path / "check.json"
     write_recording(changed(clean_motion(), "qd", 4, lambda x: 1.1 * x), path)
@@ -220,20 +170,3 @@ def test_command_refuses_with_exit_code_2(tmp_path, capsys):
     captured = capsys.readouterr()
     assert "milliseconds" in refusal(captured.err) and "milliseconds" not in captured.out
     assert captured.out.startswith("Verdict: unusable (wrong time)")
-
-
-@pytest.mark.parametrize("rows", [np.random.default_rng(0).permutation(1000), np.r_[0:500, 499:999]])
-def test_motion_with_decreasing_times_is_not_poses(rows):
-    motion = clean_motion()
-    shuffled = Recording(q=motion.q[rows], tau=motion.tau[rows], qd=motion.qd[rows], t=motion.t[rows])
-    with pytest.raises(RecordingError, match="is not greater than"):
-        Observations(shuffled, load_arm("psm")).poses()
-
-
-def test_friction_does_not_explain_leading_efforts():
-    """Presliding friction delays the efforts. It cannot make them earlier."""
-    lag = np.array([2e-3, -2e-3])
-    late, early = _lags(EffortLag(lag, 0.1 * abs(lag), 0 * lag + 2, lag != 0, lag, lag), ("yaw", "pitch"))
-    assert late.what == "tau1 lags the motion by 2.0 ms (standard error 0.2 ms)" and "friction" in late.advice
-    assert early.what == "tau2 leads the motion by 2.0 ms (standard error 0.2 ms)"
-    assert early.advice.startswith("The positions may be late") and "friction" not in early.advice

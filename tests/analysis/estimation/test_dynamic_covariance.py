@@ -10,8 +10,8 @@ import scipy.linalg
 
 from dvrk_drake.analysis.estimation.motion_estimates import (
     ResidualSeries,
-    error_covariance,
     parameter_covariance,
+    strong_correlations,
     toeplitz_product,
 )
 from dvrk_drake.analysis.observations.low_pass import low_pass
@@ -28,33 +28,6 @@ def series(period):
 
 def noise(generator, count=1):
     return low_pass(generator.normal(size=(len(T), count)), RATE, CUT_OFF)
-
-
-def independent_measurements(covariance):
-    """Returns the number of independent values for r values with this covariance (r,)."""
-    count = len(covariance)
-    pairs = 2 * np.arange(count, 0, -1)
-    pairs[0] = count
-    return float(count**2 * covariance[0] ** 2 / max(np.sum(pairs * covariance**2), 1e-300))
-
-
-def test_independent_values_of_filtered_white_noise():
-    counts = [
-        independent_measurements(error_covariance(column, column, RATE, PERIOD))
-        for column in noise(np.random.default_rng(0), 20).T
-    ]
-    assert np.mean(counts) == pytest.approx(2 * CUT_OFF * SECONDS, rel=0.15)
-
-
-def test_an_error_that_repeats_counts_once():
-    """Four periods of the same error contain as much information as one."""
-    generator = np.random.default_rng(1)
-    counts = []
-    for _ in range(20):
-        one = noise(generator)[: round(PERIOD * RATE), 0]
-        again = np.tile(one, 4)
-        counts.append(independent_measurements(error_covariance(again, again, RATE, PERIOD)))
-    assert np.mean(counts) == pytest.approx(2 * CUT_OFF * PERIOD, rel=0.25)
 
 
 @pytest.mark.parametrize("repeating", [0.0, 1.0])
@@ -130,3 +103,12 @@ def test_product_with_a_covariance_is_that_of_the_matrix(lags):
     covariance[0] = 3.0
     expected = scipy.linalg.toeplitz(covariance) @ X
     np.testing.assert_allclose(toeplitz_product(covariance, X), expected, rtol=0, atol=1e-10)
+
+
+def test_nearly_equal_columns_are_named():
+    generator = np.random.default_rng(1)
+    Y = generator.normal(0, 1, (500, 3))
+    Y[..., 1] = Y[..., 0] + 0.1 * Y[..., 1]  # correlated by 0.995: the estimates by -0.995
+    (pair,) = strong_correlations(("m4 c4x", "m5 c5x", "Izz_1"), np.linalg.inv(Y.T @ Y))
+    assert (pair.first, pair.second) == ("m4 c4x", "m5 c5x")
+    assert pair.correlation == pytest.approx(-0.995, abs=2e-3)

@@ -7,12 +7,11 @@ from recordings import csv_block
 
 import dvrk_drake as dvrk
 from dvrk_drake.analysis.excitation.design import contracted
-from dvrk_drake.analysis.excitation.information import MotionInformation, _presliding
+from dvrk_drake.analysis.excitation.information import MotionInformation
 from dvrk_drake.analysis.excitation.motion_limits import MotionLimits, motion_violations
 from dvrk_drake.analysis.excitation.periodic_motion import PeriodicMotion
 from dvrk_drake.analysis.excitation.random_motion import random_motion, state_of
 from dvrk_drake.cli import main
-from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.environment import Environment
 from dvrk_drake.workers import local_executor
@@ -74,18 +73,6 @@ def test_more_information_gives_a_smaller_error(information, state):
     at_rest[1:] = 0.0
     assert information.expected_error(at_rest, PERIOD) > once
     assert information.condition_number(state) < information.condition_number(at_rest)
-
-
-def test_presliding_with_constant_acceleration():
-    """The state is compared with that of `ActuatorEffect` for a back-and-forth motion with constant acceleration."""
-    vd, travel = 2.0, 0.1
-    t = np.arange(-2.0, 1.0, 1e-4)[:, None]
-    v = vd * t
-    element = ActuatorEffect("actuator", "presliding", travel).column(vd * t[:, 0] ** 2 / 2, v[:, 0])
-    found = _presliding(v, np.full_like(v, vd), np.array([travel]))[:, 0]
-    sliding = t[:, 0] > -1.5  # the element starts from state 0
-    np.testing.assert_allclose(found[sliding], element[sliding], atol=0.12)
-    assert np.sqrt(np.mean((found - element)[sliding] ** 2)) < 0.03
 
 
 @pytest.mark.slow

@@ -12,11 +12,9 @@ from dvrk_drake.analysis.excitation.motion_limits import (
     tip_positions,
 )
 from dvrk_drake.analysis.excitation.periodic_motion import FourierBasis, PeriodicMotion
-from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.environment import Environment
-from dvrk_drake.models.plant import inverse_dynamics
 
 pytestmark = pytest.mark.drake_api
 
@@ -81,17 +79,6 @@ def test_coupled_limit_is_checked():
     center[1:3] = [0.4, 0.3]
     lines = motion_violations(replace(motion, center=center.tolist()), arm, LIMITS)
     assert any(f"position of {coupled.name}" in line for line in lines)
-
-
-def test_efforts_are_those_of_the_regressor(arm):
-    generator = np.random.default_rng(0)
-    q = arm.sample_poses(20, generator)
-    v, vd = generator.normal(size=(2, *q.shape))
-    regressor = DynamicRegressor(arm)
-    expected = regressor.torque(q, v, vd, regressor.values)
-    np.testing.assert_allclose(inverse_dynamics(arm, q, v, vd), expected, atol=1e-9 * np.abs(expected).max())
-    weak = replace(LIMITS, effort=0.05)
-    assert any(line.startswith("effort of") for line in motion_violations(one_joint(arm, 1, 0.3), arm, weak))
 
 
 def test_tip_stays_in_its_box():

@@ -73,12 +73,6 @@ def test_parts_give_the_filtered_values_of_the_whole_motion(grid, monkeypatch):
     assert len(expected) == len(thinned.inner_rows) and np.all(np.diff(thinned.inner_rows) == 3)
 
 
-def test_actuator_coordinates_give_the_same_grid(grid):
-    other = Observations(recorded().in_actuator_coordinates(ARM), ARM).grid
-    np.testing.assert_allclose(other.q, grid.q, atol=1e-9)
-    np.testing.assert_allclose(other.vd, grid.vd, atol=1e-6)
-
-
 def test_predicted_efforts_have_the_effort_delay(grid):
     delays = [0.0, 0.004, -0.01, 0.0, 0.02, 0.0, 0.0]
     settings = SignalSettings(50.0, [20.0] * N, 20.0, delays)
