@@ -1,4 +1,14 @@
-"""Writes a picture of an arm in Meshcat. Requires Chromium, but no display."""
+"""Writes a picture of an arm in Meshcat. Requires Chromium, but no display.
+
+The pictures of the arms in docs/images:
+
+    python tools/screenshot.py docs/images/mtm.png --arm mtml --size 900 800 --pose 0 0.1 0 0.3 0.3 0.4 0 --zoom 3.6 \\
+        --target 0 -0.14 0 --camera 1.6 0.75 0.45
+    python tools/screenshot.py docs/images/psm.png --arm psm --size 900 700 --pose 0.2 -0.2 0.12 0.3 0.4 0.3 0.4 \\
+        --zoom 4 --target 0 -0.27 0.16
+    dvrk-drake teleop --output teleoperation.html
+    python tools/screenshot.py docs/images/teleoperation.png --page teleoperation.html --size 1200 750
+"""
 
 import shutil
 import subprocess
@@ -51,7 +61,7 @@ def write_picture(html: str, file: Path, width: int, height: int, chromium: str)
 
 def main() -> None:
     """Reads the options and writes the picture."""
-    parser = ArgumentParser(description=__doc__)
+    parser = ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("file", type=Path, help="PNG to write")
     parser.add_argument("--page", type=Path, help="page written by Meshcat, instead of an arm")
     parser.add_argument("--arm", default="mtml", help="name of the arm; default: mtml")
