@@ -5,8 +5,10 @@ from __future__ import annotations
 import atexit
 import ctypes
 import os
+import re
 import shlex
 import signal
+import socket
 import subprocess
 import tempfile
 import textwrap
@@ -19,6 +21,8 @@ from pathlib import Path
 LIMIT = 120.0
 #: Width of printed lines, in characters.
 WIDTH = 88
+#: Rates and delays in a line of a process. They depend on the load of the computer that builds the page.
+_FIGURES = re.compile(r"; \d+ (Hz, round trip|of \d+ steps) .*")
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None)
 
@@ -55,9 +59,10 @@ class Background:
         return self._process.poll() is None
 
     def show(self) -> None:
-        """Prints the output since the last call."""
+        """Prints the output since the last call, without rates and delays."""
         output = self._log.read_text()
         for line in output[self._shown :].splitlines():
+            line = _FIGURES.sub("; ...", line)  # noqa: PLW2901
             print(textwrap.fill(line, WIDTH, subsequent_indent="    ", drop_whitespace=False, break_on_hyphens=False))
         self._shown = len(output)
 
@@ -90,6 +95,31 @@ class Background:
             with suppress(ProcessLookupError):
                 os.killpg(self.pid, signal.SIGKILL)
             self._process.wait(LIMIT)
+
+
+def own_network() -> None:
+    """Selects a free port for the LCM messages of this notebook, which stay on this computer."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("", 0))
+        port = free.getsockname()[1]
+    os.environ["LCM_DEFAULT_URL"] = f"udpm://239.255.76.67:{port}?ttl=0"
+
+
+def start_controller(command: str) -> Background:
+    """Starts a controller, waits until its efforts act, and prints its output.
+
+    On a busy computer, the guard may stop it. Then this function tries again.
+    """
+    for _ in range(6):
+        controller = Background(command)
+        try:
+            controller.wait_for("effort;", show=False)
+        except RuntimeError:
+            command = command.removesuffix(" --reset") + " --reset"
+        else:
+            controller.show()
+            return controller
+    raise RuntimeError(f"{command} does not reach the state effort")
 
 
 def wait_until(condition: Callable[[], bool], what: str) -> None:

@@ -41,6 +41,11 @@ SHELL = ("|", "&", "&&", ";")
 INLINE = re.compile(rf"`(?:dvrk-drake )?(?P<words>(?:{'|'.join(NAMES)}) [^`]*--[^`]*)`")
 
 
+def text_of(page):
+    """Returns the text of a page in which each command is one line."""
+    return re.sub(r"\\\n\s*", "", page.read_text())
+
+
 def options_of(command):
     found = app
     for name in command.split():
@@ -50,9 +55,9 @@ def options_of(command):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_documented_commands_are_valid(page):
-    text = page.read_text()
+    text = text_of(page)
     for found in LINE.finditer(text):
-        words = shlex.split(found["words"].removesuffix("\\"), comments=True)
+        words = shlex.split(found["words"], comments=True)
         end = next((i for i, word in enumerate(words) if word in SHELL or word.startswith(("2>", ">"))), len(words))
         words = words[:end]
         if "..." in words or any(word.startswith("[") for word in words):
@@ -77,7 +82,7 @@ def test_documented_commands_are_valid(page):
 def test_commands_with_samples_run(page, tmp_path, monkeypatch):
     """The commands of a page run in their order, as a new user enters them."""
     monkeypatch.chdir(tmp_path)
-    for found in LINE.finditer(page.read_text()):
+    for found in LINE.finditer(text_of(page)):
         words = shlex.split(found["words"], comments=True)
         if any(word.startswith("samples") for word in words):
             assert main(words) == 0, f"dvrk-drake {found['words']}"
@@ -94,7 +99,7 @@ def test_printed_commands_have_valid_options():
 
 
 def test_documentation_contains_all_commands():
-    lines = [" ".join(found["words"].split()) for page in PAGES for found in LINE.finditer(page.read_text())]
+    lines = [" ".join(found["words"].split()) for page in PAGES for found in LINE.finditer(text_of(page))]
     assert not [name for name in NAMES if name != "demo" and not any(line.startswith(name) for line in lines)]
 
 
