@@ -81,6 +81,11 @@ def substitute(words, folder):
     return 0
 
 
+def command(folder, *options, poses=8):
+    """Returns a calibration of a PSM in a folder, without questions."""
+    return ["calibrate", "--arm", "psm", "--output", str(folder), "--poses", str(poses), "--yes", *map(str, options)]
+
+
 def refused(capsys, *words):
     capsys.readouterr()
     assert main(list(words)) == 2
@@ -120,15 +125,14 @@ def test_gravity_file_is_chosen_by_the_joints_of_the_arm(tmp_path, like, joints,
 
 
 def test_only_incomplete_steps_are_repeated(tmp_path, ran, capsys):
-    command = ["calibrate", "--arm", "psm", "--output", str(tmp_path / "c"), "--poses", "8", "--yes"]
-    assert main(command) == 0
+    assert main(command(tmp_path / "c")) == 0
     once, count = list(ran), len(ran)
     assert count == 17
     assert "17/17] Export the gravity compensation" in capsys.readouterr().out
-    assert main(command) == 0 and len(ran) == count  # nothing to do
+    assert main(command(tmp_path / "c")) == 0 and len(ran) == count  # nothing to do
     assert "[1/17] Choose static poses: done" in capsys.readouterr().out
 
-    interrupted = ["calibrate", "--arm", "psm", "--output", str(tmp_path / "d"), "--poses", "8", "--yes"]
+    interrupted = command(tmp_path / "d")
     ran.clear()
     for step in range(count):
         ran.interrupt_at = 2 * step
@@ -144,25 +148,13 @@ def test_only_incomplete_steps_are_repeated(tmp_path, ran, capsys):
 
 
 def test_all_parts_of_a_motion_are_identified(tmp_path, ran):
-    assert main(["calibrate", "--arm", "psm", "--output", str(tmp_path / "c"), "--poses", "8", "--yes"]) == 0
+    assert main(command(tmp_path / "c")) == 0
     dynamic = next(words for words in ran if words[0] == "identify" and "model.yaml" in words)
     assert dynamic[1:4] == ["motion.csv", "motion_2.csv", "poses.csv"]
 
 
 def test_only_the_next_motion_resets_a_fault(tmp_path, ran):
-    command = [
-        "calibrate",
-        "--arm",
-        "psm",
-        "--output",
-        str(tmp_path / "c"),
-        "--poses",
-        "8",
-        "--yes",
-        "--reset",
-        "--realtime",
-    ]
-    assert main(command) == 0
+    assert main(command(tmp_path / "c", "--reset", "--realtime")) == 0
     moving = [words for words in ran if words[0] == "collect"]
     assert ["--reset" in words for words in moving] == [True] + 5 * [False]
     assert all("--realtime" in words for words in moving)
@@ -171,24 +163,24 @@ def test_only_the_next_motion_resets_a_fault(tmp_path, ran):
 def test_designs_avoid_the_objects_around_the_arm(tmp_path, ran, capsys):
     lab = tmp_path / "lab.dmd.yaml"
     lab.write_text(OTHER_ARM.format(x=0.6))
-    command = ["calibrate", "--arm", "psm", "--output", str(tmp_path / "c"), "--poses", "8", "--yes"]
     around = ["--table", "-0.2", "--environment"]
-    assert main([*command, *around, str(lab)]) == 0
+    calibrate = command(tmp_path / "c", *around, lab)
+    assert main(calibrate) == 0
     designs = [words for words in ran if words[0] == "excite"]
     assert len(designs) == 4
     for words in designs:
         begin = words.index("--table")
         assert words[begin : begin + 4] == [*around, "environment.dmd.yaml"]
     assert (tmp_path / "c" / "environment.dmd.yaml").read_text() == lab.read_text()
-    assert main([*command, *around, str(lab)]) == 0
+    assert main(calibrate) == 0
     lab.write_text(OTHER_ARM.format(x=0.7))
-    assert "began with another --environment" in refused(capsys, *command, *around, str(lab))
+    assert "began with another --environment" in refused(capsys, *calibrate)
     assert "table is -0.2, but None was given" in refused(
-        capsys, *command, "--environment", str(tmp_path / "c" / "environment.dmd.yaml")
+        capsys, *command(tmp_path / "c", "--environment", tmp_path / "c" / "environment.dmd.yaml")
     )
     lab.write_text(OTHER_ARM.format(x=0.6))
     (tmp_path / "c" / "environment.dmd.yaml").write_text(OTHER_ARM.format(x=0.7))
-    assert "environment.dmd.yaml: the file was changed" in refused(capsys, *command, *around, str(lab))
+    assert "environment.dmd.yaml: the file was changed" in refused(capsys, *calibrate)
 
 
 def test_without_terminal_an_arm_moves_only_with_yes(tmp_path, ran, capsys):
@@ -198,31 +190,30 @@ def test_without_terminal_an_arm_moves_only_with_yes(tmp_path, ran, capsys):
 
 def test_failed_step_ends_the_calibration(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(calibration, "_run", lambda words, folder: 2)
-    line = refused(capsys, "calibrate", "--arm", "psm", "--output", str(tmp_path / "c"), "--yes")
+    line = refused(capsys, *command(tmp_path / "c"))
     assert "Choose static poses failed" in line
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("poses", "options", "message"),
     [
-        (["--poses", "3"], "poses is 3; allowed: 8..300"),
-        (["--duration", "5"], "duration is 5"),
-        (["--gravity", "0", "0", "99"], "gravity"),
-        (["--table", "nan"], "table"),
+        (3, [], "poses is 3; allowed: 8..300"),
+        (8, ["--duration", "5"], "duration is 5"),
+        (8, ["--gravity", "0", "0", "99"], "gravity"),
+        (8, ["--table", "nan"], "table"),
     ],
 )
-def test_invalid_settings_give_one_line(tmp_path, capsys, options, message):
-    assert message in refused(capsys, "calibrate", "--arm", "psm", "--yes", "--output", str(tmp_path / "c"), *options)
+def test_invalid_settings_give_one_line(tmp_path, capsys, poses, options, message):
+    assert message in refused(capsys, *command(tmp_path / "c", *options, poses=poses))
     assert not (tmp_path / "c").exists()
 
 
 def test_folder_of_another_calibration_is_refused(tmp_path, ran, capsys):
-    command = ["calibrate", "--arm", "psm", "--output", str(tmp_path / "c"), "--yes", "--poses"]
-    assert main([*command, "8"]) == 0
-    assert "poses is 8, but 9 was given" in refused(capsys, *command, "9")
+    assert main(command(tmp_path / "c")) == 0
+    assert "poses is 8, but 9 was given" in refused(capsys, *command(tmp_path / "c", poses=9))
     (tmp_path / "d").mkdir()
     (tmp_path / "d" / "thesis.tex").touch()
-    line = refused(capsys, "calibrate", "--arm", "psm", "--output", str(tmp_path / "d"), "--yes")
+    line = refused(capsys, *command(tmp_path / "d"))
     assert "the folder is not empty and has no calibration" in line
     assert os.listdir(tmp_path / "d") == ["thesis.tex"]
 

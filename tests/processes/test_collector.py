@@ -262,3 +262,5 @@ def test_earlier_refusal_is_not_reported():
     status.num_refused, status.num_ignored, status.ignored_code = 3, 1, Status.REFUSAL_NOT_AUTHENTIC
     problem = takeover_reason(status, before, AnswerTimes())
     assert problem == "the arm ignores messages: not signed with the arm's key (--key)"
+    status.num_expired = 3
+    assert takeover_reason(status, before, AnswerTimes()) == "commands arrived too late (use --realtime)"

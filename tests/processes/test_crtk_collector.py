@@ -81,19 +81,6 @@ def test_repeated_enter_does_not_continue(collection):
     assert collection.collector.paused
 
 
-def test_stop_and_resume(tmp_path):
-    path, arm = tmp_path / "p.csv", SubstituteArm(MTML)
-    collector = Collection(
-        arm, POSES, path, stopped=lambda: path.exists() and path.read_bytes().count(b"\n") == 2
-    ).run()
-    assert collector.problem is None and collector.done.tolist() == [True, False]
-    again = Collection(arm, POSES, path)
-    assert again.collector.done.tolist() == [True, False]
-    assert again.run().done.all() and len(again.lines) == 1
-    with pytest.raises(CollectionError, match="not in the pose file"):
-        Collection(arm, POSES[:1] + 0.01, path)
-
-
 def disturb(arm, **changes):
     for name, value in changes.items():
         setattr(arm, name, value)
@@ -165,22 +152,6 @@ def test_short_effort_peak_is_accepted(collection):
     collection.run(lambda: collection.arm.time > end)
     collection.arm.extra = np.zeros(7)
     assert collection.run().problem is None
-
-
-def test_pose_without_rest_is_skipped(tmp_path):
-    arm = SubstituteArm(MTML)
-    collection = Collection(arm, POSES[:1], tmp_path / "p.csv", both_sides=False)
-    receive, noise = arm.receive, np.random.default_rng(0)
-
-    def shaking():
-        is_new = receive()
-        arm.measurement.q = arm.measurement.q + noise.uniform(-0.02, 0.02, 7)
-        return is_new
-
-    arm.receive = shaking
-    collector = collection.run()
-    assert collector.unsettled == [1] and not collector.done.any() and collector.problem is None
-    assert "did not come to rest within 10 s" in collection.lines[0]
 
 
 def test_start_outside_the_limits_is_refused(collection):

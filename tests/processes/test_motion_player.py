@@ -228,14 +228,6 @@ def test_ends_when_arm_moved_after_the_check(motion):
     assert "moved before the control started" in str(player.problem)
 
 
-def test_ends_when_file_cannot_be_written(tmp_path, motion):
-    (tmp_path / "m.csv").mkdir()
-    player, controller, sticky = make_player(motion, tmp_path / "m.csv")
-    run_collector(player, controller, sticky, 10.0)
-    player.close()
-    assert player.finished and isinstance(player.problem, RecordingError)
-
-
 def test_full_disk_ends_the_motion(tmp_path, motion):
     class Full(MotionPartFile):
         def append(self, rows):

@@ -13,10 +13,8 @@ from waiting import TIMEOUT
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import DvrkDrakeError, StationError
-from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes import pace
-from dvrk_drake.processes.live_status import AnswerTimes, takeover_reason
 from dvrk_drake.processes.simulated_arm import load_driver, start_pose, stop_on_signals
 from dvrk_drake.systems.lcm.lcm_network import open_lcm
 
@@ -228,14 +226,3 @@ def test_rejects_model_of_another_arm(tmp_path, capfd):
     IdentifiedModel.from_arm(load_arm("mtmr")).save(path)
     assert main(["control", "--arm", "mtml", "--model", str(path)]) == 2
     assert "model.yaml: the model is for MTMR, not for MTML" in capfd.readouterr().err
-
-
-def test_takeover_reason():
-    before, status = lcmt_dvrk_status(), lcmt_dvrk_status()
-    status.guard_state = lcmt_dvrk_status.STATE_OFF
-    assert takeover_reason(status, before, AnswerTimes()) == "its state is off"
-    status.num_expired = 3
-    assert takeover_reason(status, before, AnswerTimes()) == "commands arrived too late (use --realtime)"
-    status.num_expired, status.num_refused = 0, 1
-    status.refusal_code = lcmt_dvrk_status.REFUSAL_START_FAR
-    assert "start too far" in takeover_reason(status, before, AnswerTimes())

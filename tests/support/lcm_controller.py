@@ -7,10 +7,10 @@ With --echo, the process only answers with HOLD commands. With --clock-jump, its
 """
 
 import sys
-import time
 
 import lcm
 import numpy as np
+from effort_controller import effort_command
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm_files import load_arm
@@ -32,18 +32,14 @@ class Controller:
         q, v = np.array(status.position), np.array(status.velocity)
         if self.held is None:
             self.held = q, np.array(status.effort_measured)
-        n = self.arm.num_joints
-        command = lcmt_dvrk_command()
+        q_held, effort = self.held
         self.sequence += 1
-        command.utime, command.sequence, command.sender_id = time.monotonic_ns() // 1000, self.sequence, self.sender_id
+        effort = effort + self.kp * (q_held - q) - self.kd * v
+        command = effort_command(status, effort, self.sender_id, self.sequence)
         if self.sequence >= 1000:
             command.utime += round(1e6 * self.clock_jump)
-        command.session_id, command.status_utime = status.session_id, status.utime
-        command.arm_name, command.num_joints = self.arm.name, n
-        command.control_mode = lcmt_dvrk_command.HOLD if self.echo else lcmt_dvrk_command.EFFORT
-        command.position, command.velocity = [0.0] * n, [0.0] * n
-        q_held, effort = self.held
-        command.effort = (effort + self.kp * (q_held - q) - self.kd * v).tolist()
+        if self.echo:
+            command.control_mode = lcmt_dvrk_command.HOLD
         self.lcm.publish(f"DVRK_COMMAND_{self.arm.name}", command.encode())
 
 
@@ -62,12 +58,9 @@ def main(arguments: list[str]) -> None:
 def flood(arguments: list) -> None:
     """Publishes one valid command of another sender at maximum rate. Arguments: URL, encoded status to answer."""
     url, data = arguments
-    network, status, command = lcm.LCM(url), lcmt_dvrk_status.decode(data), lcmt_dvrk_command()
-    n = status.num_joints
-    command.utime, command.sequence, command.sender_id = 1, 2, draw_id()
-    command.session_id, command.status_utime = status.session_id, status.utime
-    command.arm_name, command.num_joints, command.control_mode = status.arm_name, n, lcmt_dvrk_command.EFFORT
-    command.position = command.velocity = command.effort = [0.0] * n
+    network, status = lcm.LCM(url), lcmt_dvrk_status.decode(data)
+    command = effort_command(status, [0.0] * status.num_joints, draw_id(), 2)
+    command.utime = 1
     message = command.encode()
     while True:
         network.publish(f"DVRK_COMMAND_{status.arm_name}", message)

@@ -5,11 +5,10 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-from pydrake.multibody.plant import MultibodyPlant
 
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.models.plant import make_arm_plant
+from dvrk_drake.models.plant import inverse_dynamics
 from dvrk_drake.recordings.recording import Recording
 
 RATE, PERIOD, PASSES = 200.0, 6.0, 4
@@ -35,27 +34,6 @@ def trajectory(arm: Arm, t: np.ndarray, period: float = PERIOD, seed: int = 1) -
     return middle + scale * q, scale * v, scale * vd
 
 
-def inverse_dynamics(arm: Arm, plant: MultibodyPlant, q: np.ndarray, v: np.ndarray, vd: np.ndarray) -> np.ndarray:
-    """Returns the joint efforts (m, n): efforts of the tree, projected through the linkage."""
-    context = plant.CreateDefaultContext()
-    order = [plant.GetJointByName(name).velocity_start() for name in arm.tree_joint_names]
-    tree = np.empty((3, len(q), plant.num_velocities()))
-    tree[0][:, order] = arm.linkage.position(q)
-    tree[1][:, order] = arm.linkage.velocity(v)
-    tree[2][:, order] = arm.linkage.velocity(vd)
-    tau = np.empty((len(q), len(order)))
-    from pydrake.multibody.tree import MultibodyForces
-
-    forces = MultibodyForces(plant)
-    for i in range(len(q)):
-        plant.SetPositions(context, tree[0][i])
-        plant.SetVelocities(context, tree[1][i])
-        forces.SetZero()
-        plant.CalcForceElementsContribution(context, forces)
-        tau[i] = plant.CalcInverseDynamics(context, tree[2][i], forces)[order]
-    return arm.linkage.pull_back_effort(tau)
-
-
 @cache
 def efforts(name: str, period: float = PERIOD) -> tuple[np.ndarray, ...]:
     """Returns t, q, v, tau (joint coordinates) for PASSES * PERIOD seconds, sampled at 5 RATE."""
@@ -63,7 +41,7 @@ def efforts(name: str, period: float = PERIOD) -> tuple[np.ndarray, ...]:
     t = np.arange(0, PASSES * PERIOD, 0.2 / RATE)
     coarse = t[::5]
     q, v, vd = trajectory(arm, coarse, period)
-    rigid = inverse_dynamics(arm, make_arm_plant(arm), q, v, vd)
+    rigid = inverse_dynamics(arm, q, v, vd)
     a_rigid = arm.transmission.inverse.pull_back_effort(rigid)
     fine = np.column_stack([np.interp(t, coarse, x) for x in a_rigid.T])
     q, v, _ = trajectory(arm, t, period)
@@ -74,14 +52,8 @@ def efforts(name: str, period: float = PERIOD) -> tuple[np.ndarray, ...]:
     return t, q, v, arm.transmission.pull_back_effort(fine + friction)
 
 
-def clean_motion(name: str = "psm", *, at: np.ndarray | None = None, effort_lag: float = 0.0, **options) -> Recording:
-    """Returns a recording at 200 Hz or at times `at` [s]. Efforts have a delay `effort_lag` [s] and white noise."""
-    t, q, v, tau = efforts(name, **options)
-    times = t[::5] if at is None else at
-
-    def sample(x, times=times):
-        return np.column_stack([np.interp(times, t, column) for column in x.T])
-
-    tau = sample(tau, np.clip(times - effort_lag, 0, None))
+def clean_motion(name: str = "psm", **options) -> Recording:
+    """Returns a recording at 200 Hz. Its efforts have white noise."""
+    t, q, v, tau = (x[::5] for x in efforts(name, **options))
     noise = np.random.default_rng(2).normal(size=tau.shape) * EFFORT_NOISE * np.sqrt(np.mean(tau**2, axis=0))
-    return Recording(sample(q), tau + noise, sample(v), np.arange(len(times)) / RATE, source="motion.csv")
+    return Recording(q, tau + noise, v, t, source="motion.csv")
