@@ -1,9 +1,13 @@
 """Configuration of the documentation site (Sphinx, MyST-NB). `make docs` builds it."""
 
 import os
+import re
 import sys
 from importlib.metadata import version as installed_version
 from pathlib import Path
+
+from sphinx.application import Sphinx
+from sphinx.util.inspect import TypeAliasForwardRef
 
 DOCS = Path(__file__).resolve().parent
 sys.path.insert(0, str(DOCS))  # for the extension `pydrake_system`
@@ -45,8 +49,14 @@ nb_merge_streams = True
 nb_ipywidgets_js: dict[str, dict[str, str]] = {}
 
 autosummary_generate = True
-autodoc_default_options = {"members": True, "show-inheritance": False, "member-order": "bysource"}
+autodoc_default_options = {"members": True, "member-order": "bysource"}
+# Signatures contain names and defaults. The types are in the lists of the parameters.
+autodoc_typehints = "description"
+autodoc_typehints_description_target = "documented"
 autodoc_typehints_format = "short"
+autodoc_preserve_defaults = True
+autodoc_type_aliases = {"ArrayLike": "ArrayLike", "NDArray": "NDArray"}
+napoleon_attr_annotations = False
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
@@ -57,3 +67,23 @@ templates_path = ["_templates"]
 html_theme_options = {"source_repository": "", "navigation_with_keys": True}
 copybutton_prompt_text = "$ "
 copybutton_exclude = ".linenos, .gp, .go"
+
+
+def array_alias(alias: TypeAliasForwardRef, _item: object) -> TypeAliasForwardRef:
+    """Returns the alias of an array, without the type of its elements. Sphinx cannot subscript aliases itself."""
+    return alias
+
+
+def split_attributes(_app: Sphinx, _what: str, _name: str, _obj: object, _options: object, lines: list[str]) -> None:
+    """Replaces each entry "a, b: text" of an attribute list by one entry per name, as Napoleon requires."""
+    text = "\n".join(lines)
+    start, heading, attributes = text.partition("Attributes:\n")
+    entry = re.compile(r"^( {4})(\w+(?:, \w+)+)(:(?:.*\n?)(?: {5,}.*\n?)*)", re.MULTILINE)
+    split = entry.sub(lambda m: "".join(f"{m[1]}{n}{m[3].rstrip()}\n" for n in m[2].split(", ")), attributes)
+    lines[:] = (start + heading + split).split("\n")
+
+
+def setup(app: Sphinx) -> None:
+    """Registers the handler, which runs before that of Napoleon (priority 500)."""
+    TypeAliasForwardRef.__getitem__ = array_alias
+    app.connect("autodoc-process-docstring", split_attributes, priority=400)
