@@ -97,3 +97,11 @@ def test_gravity_of_si_arms_equals_that_of_the_controller(name, shared_data, tmp
     if name == "psm_si":  # The rounded angles of the file cause this difference.
         file = share / "kinematic" / "PSM_Si_physical.json"
         np.testing.assert_allclose(judge(shared_data, "judge_psm", file, q[:, :3]), tau[:, :3], atol=1e-4)
+
+
+def test_disc_coupling_is_that_of_the_dvrk():
+    M = np.array([[-1.5632, 0, 0, 0], [0, 1.0186, 0, 0], [0, -0.8306, 0.6089, 0.6089], [0, 0, -1.2177, 1.2177]])
+    disc = np.array([0.1, -0.2, 0.3, 0.5])
+    q = np.concatenate([[0.1, 0.2, 0.05], M @ disc])
+    a = load_arm("psm").transmission.position(q)
+    np.testing.assert_allclose(a, np.concatenate([[0.1, 0.2, 0.05], disc]), atol=1e-12)

@@ -75,20 +75,6 @@ def test_custom_instrument_is_simulated_without_self_collision(folder, name):
     assert not query.inspector().GetCollisionCandidates()
 
 
-@pytest.mark.parametrize(
-    ("limits", "message"),
-    [
-        ("[0.0, .nan]", r"is nan; allowed: a finite number"),
-        ("[0.0, 240]", r"\[1\] is 240; allowed: -30\.\.30 m; is it in mm\?"),
-        ("[0.2]", r"is \[0\.2\]; allowed: \[lower, upper\]"),
-    ],
-)
-def test_invalid_limits_or_limits_in_millimetres_are_refused(folder, limits, message):
-    (folder / "bad.yaml").write_text((folder / "arm.yaml").read_text().replace("[0.0, 0.24]", limits))
-    with pytest.raises(ArmError, match=f"position_limits.insertion.*{message}"):
-        load_arm(str(folder / "bad.yaml"))
-
-
 def test_missing_instrument_file_is_named(folder):
     (folder / "bad.yaml").write_text((folder / "arm.yaml").read_text().replace("probe.yaml", "gone.yaml"))
     with pytest.raises(ArmError, match=r"bad\.yaml: instrument .*gone\.yaml does not exist"):

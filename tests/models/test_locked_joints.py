@@ -170,14 +170,6 @@ def test_model_file_restores_the_locked_joints(tmp_path):
         IdentifiedModel.load(tmp_path / "bad.yaml")
 
 
-def test_model_files_state_the_locked_joints(tmp_path):
-    IdentifiedModel.from_arm(load_arm("psm")).save(tmp_path / "m.yaml")
-    text = (tmp_path / "m.yaml").read_text()
-    (tmp_path / "m.yaml").write_text(text.replace("locked_joints: {}\n", ""))
-    with pytest.raises(ModelError, match="locked_joints is missing"):
-        IdentifiedModel.load(tmp_path / "m.yaml")
-
-
 def controller(arm):
     return GravityPidController(IdentifiedModel.from_arm(arm))
 

@@ -1,7 +1,6 @@
 """Tests mirrored wrists of left and right arms: equations, files of real arms, exported models."""
 
 import dataclasses
-import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 import pytest
@@ -19,15 +18,12 @@ from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_c
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions
-from dvrk_drake.models.sdf_model import MODELS_FOLDER
 from dvrk_drake.recordings.reading import read_recording
 
 pytestmark = pytest.mark.drake_api
 
 #: Signs that mirror the joint angles and torques of an arm in the plane x = 0.
 MIRROR = np.array([-1.0, 1.0, 1.0, -1.0, 1.0, -1.0, -1.0])
-#: Index of the parameter my5 - mz4 of the lateral wrist brackets in the gravity compensation file.
-P6 = 5
 
 
 def torque(arm, q):
@@ -37,26 +33,11 @@ def torque(arm, q):
     return holding_torque(plant, context, arm)
 
 
-def p6(name):
-    options = CompensationOptions(tolerance=0.01)
-    return compensation_from_model(IdentifiedModel.from_arm(load_arm(name)), options).positive[P6]
-
-
 def test_left_and_right_are_mirror_images():
     left, right = load_arm("mtml"), load_arm("mtmr")
     for q in left.sample_poses(5, np.random.default_rng(0)):
         np.testing.assert_allclose(torque(left, q), MIRROR * torque(right, MIRROR * q), atol=1e-12)
         assert np.abs(torque(left, q) - torque(right, q)).max() > 0.01
-
-
-@pytest.mark.slow
-def test_wrist_brackets_are_on_the_sides_of_real_arms(shared_data):
-    folder = shared_data / "gc_json"
-    if not folder.is_dir():
-        pytest.skip(f"needs {folder}")
-    for name, serial in (("mtml", "MTML-22723"), ("mtml", "MTML-34863"), ("mtmr", "MTMR-32336")):
-        file = GravityCompensationFile.load(folder / f"gc-{serial}.json")
-        assert np.sign(p6(name)) == np.sign((file.positive + file.negative)[P6])
 
 
 @pytest.mark.slow
@@ -132,42 +113,3 @@ def test_side_is_detected_from_the_parameters_of_a_real_file(shared_data, serial
     for name in ("mtml", "mtmr"):
         comparison = compare_compensation(dataclasses.replace(file, arm_name=""), stock(name))
         assert comparison.other_side == (name != side)
-
-
-def test_wrists_of_both_files_are_mirror_images():
-    """Compares inertias and shapes. Reflection in x = 0 maps a pose (R, p) to (M R M, M p), M = diag(-1, 1, 1)."""
-    left, right = (
-        {link.get("name"): link for link in ElementTree.parse(MODELS_FOLDER / f"sdf/{name}.sdf").iter("link")}
-        for name in ("mtml", "mtmr")
-    )
-    signs = {"pose": np.array([-1, 1, 1, 1, -1, -1]), "ixy": -1, "ixz": -1}
-    assert left.keys() == right.keys()
-    for name in left:
-        is_wrist = name in ("platform_link", "wrist_pitch_link", "wrist_yaw_link", "wrist_roll_link")
-        parts = [
-            [part for child in links[name] if child.tag != "pose" for part in child.iter()] for links in (left, right)
-        ]
-        parts[0] = [part for part in parts[0] if part.tag != "scale"]
-        for one, other in zip(*parts, strict=True):
-            assert one.tag == other.tag
-            if one.tag in ("pose", "mass", "size", "radius", "length") or (
-                one.tag.startswith("i") and len(one.tag) == 3
-            ):
-                numbers, expected = (np.array(part.text.split(), float) for part in (one, other))
-                sign = signs.get(one.tag, 1) if is_wrist else 1
-                np.testing.assert_allclose(numbers, sign * expected, atol=1e-12, err_msg=f"{name}: {one.tag}")
-            elif one.tag == "uri":
-                assert one.text == other.text
-        scales = [[scale.text.split() for scale in links[name].iter("scale")] for links in (left, right)]
-        assert scales == [[["-1", "1", "1"]] if is_wrist else [], []]
-
-
-@pytest.mark.slow
-def test_an_exported_left_arm_can_replace_that_of_the_package(tmp_path):
-    assert main(["export", "--arm", "mtml", "--sdf", str(tmp_path / "left.sdf")]) == 0
-    content = (MODELS_FOLDER / "arms/mtml.yaml").read_text()
-    (tmp_path / "mtml.yaml").write_text(content.replace("package://dvrk_drake/sdf/mtml.sdf", "left.sdf"))
-    left, exported = load_arm("mtml"), load_arm(str(tmp_path / "mtml.yaml"))
-    assert exported.sdf == (str(tmp_path / "left.sdf"),)
-    for q in left.sample_poses(3, np.random.default_rng(0)):
-        np.testing.assert_allclose(torque(exported, q), torque(left, q), atol=1e-12)

@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from pydrake.multibody.parsing import LoadModelDirectives, Parser, ProcessModelDirectives
+from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, DiscreteContactApproximation, MultibodyPlant
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
@@ -13,7 +13,6 @@ from repository import ROOT
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import known_arms, load_arm
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, package_map, set_arm_positions
-from dvrk_drake.models.sdf_model import MODELS_FOLDER
 
 pytestmark = pytest.mark.drake_api
 
@@ -97,15 +96,6 @@ def test_simulated_links_do_not_collide_and_linkage_follows(name):
     assert np.abs(tree - start[index]).max() > 1e-3, "the arm falls"
     independent = [arm.tree_joint_names.index(joint) for joint in arm.joint_names]
     np.testing.assert_allclose(tree, arm.linkage.position(tree[independent]), atol=1e-4)
-
-
-def test_model_directives_can_be_processed():
-    plant = MultibodyPlant(1e-3)
-    parser = Parser(plant)
-    parser.package_map().AddMap(package_map())
-    directives = LoadModelDirectives(str(MODELS_FOLDER / "directives" / "psm.dmd.yaml"))
-    models = ProcessModelDirectives(directives, parser)
-    assert [model.model_name for model in models] == ["psm", "large_needle_driver"]
 
 
 def test_code_of_the_page_about_drake_runs(capsys):

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.tree import SpatialInertia, UnitInertia
-from pydrake.systems.analysis import Simulator
 
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm_files import known_arms, load_arm
@@ -84,35 +83,6 @@ def test_parallelogram_is_closed_within_the_limits(arm, plant):
         assert np.linalg.norm(gap) < 1e-9
 
 
-def test_crank_follows_the_forearm_and_coupler_the_upper_arm(arm, plant):
-    context = plant.CreateDefaultContext()
-    set_arm_positions(plant, context, arm, [0.2, 0.5, -0.3, 0.1, 0.2, 0.3, 0.4])
-
-    def rotation(name):
-        return plant.GetBodyByName(name).EvalPoseInWorld(context).rotation().matrix()
-
-    np.testing.assert_allclose(rotation("crank_link"), rotation("forearm_link"), atol=1e-12)
-    np.testing.assert_allclose(rotation("coupler_link"), rotation("upper_arm_link"), atol=1e-12)
-
-
-def test_inertias_are_consistent_and_centres_of_mass_off_joints(plant):
-    for index in plant.GetBodyIndices(plant.GetBodyByName("base_link").model_instance()):
-        body = plant.get_body(index)
-        if body.name() == "base_link":
-            continue
-        # The centre of mass of a rotor must be on its axis.
-        assert (np.linalg.norm(body.default_com()) > 1e-3) == (body.name() != "motor_4_link")
-        M = body.default_spatial_inertia()
-        assert M.IsPhysicallyValid()
-        # The pseudo-inertia of a real body is positive definite (Wensing, Kim, Slotine 2018).
-        I_o = M.CalcRotationalInertia().CopyToFullMatrix3()
-        pseudo = np.zeros((4, 4))
-        pseudo[:3, :3] = 0.5 * np.trace(I_o) * np.eye(3) - I_o
-        pseudo[:3, 3] = pseudo[3, :3] = body.default_mass() * body.default_com()
-        pseudo[3, 3] = body.default_mass()
-        assert np.linalg.eigvalsh(pseudo).min() > 1e-7, body.name()
-
-
 def test_motor_4_couples_elbow_and_platform(arm, plant):
     """Checks that rotor 4, which rotates by 0.6697 q3 + q4, adds J_4' I J_4 to the mass matrix G' M G."""
     context = plant.CreateDefaultContext()
@@ -134,7 +104,10 @@ def test_motor_4_couples_elbow_and_platform(arm, plant):
     assert I_Bo[2, 2] == pytest.approx(10.53**2 * 1e-6, rel=1e-4)
 
 
-def test_holding_torque_is_the_gradient_of_potential_energy(arm, plant):
+@pytest.mark.parametrize("name", ["mtml", "psm"])
+def test_holding_torque_is_the_gradient_of_potential_energy(name):
+    arm = load_arm(name)
+    plant = make_arm_plant(arm)
     context = plant.CreateDefaultContext()
 
     def energy(q):
@@ -146,60 +119,6 @@ def test_holding_torque_is_the_gradient_of_potential_energy(arm, plant):
         gradient = [(energy(q + h * e) - energy(q - h * e)) / (2 * h) for e in np.eye(7)]
         set_arm_positions(plant, context, arm, q)
         np.testing.assert_allclose(holding_torque(plant, context, arm), gradient, atol=1e-8)
-
-
-def test_pinned_loop_has_the_same_holding_torque(arm, plant):
-    """Computes the holding torque of closure "ball" from the null space of the numerical constraint Jacobian."""
-    loop_plant = make_arm_plant(arm, closure="ball")
-    assert loop_plant.num_constraints() == plant.num_constraints()  # a ball and a distance instead of two mimics
-    (loop,) = arm.loop_closures
-    A, B = (loop_plant.GetFrameByName(name) for name in (loop.frame_a, loop.frame_b))
-    context, loop_context = plant.CreateDefaultContext(), loop_plant.CreateDefaultContext()
-    select = tree_selector(loop_plant, arm)
-    names = list(arm.tree_joint_names)
-    motor = select[names.index("motor_4")]
-    for q in poses(arm):
-        set_arm_positions(loop_plant, loop_context, arm, q)
-        q_full = loop_plant.GetPositions(loop_context)
-        jacobian = np.zeros((3, len(q_full)))
-        h = 1e-6
-        for k in range(len(q_full)):
-            gaps = []
-            for sign in (1, -1):
-                loop_plant.SetPositions(loop_context, q_full + sign * h * np.eye(len(q_full))[k])
-                gaps.append(
-                    A.CalcPoseInWorld(loop_context).translation() - B.CalcPoseInWorld(loop_context).translation()
-                )
-            jacobian[:, k] = (gaps[0] - gaps[1]) / (2 * h)
-        loop_plant.SetPositions(loop_context, q_full)
-        tau_g = loop_plant.CalcGravityGeneralizedForces(loop_context)
-        independent = select[:7]
-        dependent = [i for i in range(len(q_full)) if i not in independent and i != motor]
-        # J_d qd_d = -J_i qd_i defines the velocities of crank and coupler.
-        follow = -np.linalg.pinv(jacobian[:, dependent]) @ jacobian[:, independent]
-        tau = -(tau_g[independent] + follow.T @ tau_g[dependent])
-        set_arm_positions(plant, context, arm, q)
-        np.testing.assert_allclose(tau, holding_torque(plant, context, arm), atol=1e-8)
-
-
-@pytest.mark.parametrize("closure", ["mimic", "ball"])
-def test_holding_torque_holds_the_simulated_linkage(arm, closure):
-    plant = make_arm_plant(arm, closure=closure)
-    simulator = Simulator(plant)
-    context = simulator.get_mutable_context()
-    q = np.array([0.2, 0.3, -0.2, 0.5, 0.6, 0.2, 0.4])
-    set_arm_positions(plant, context, arm, q)
-    tau = holding_torque(plant, context, arm)
-    u = np.zeros(plant.num_actuated_dofs())
-    for name, effort in zip(arm.joint_names, tau, strict=True):
-        u[plant.GetJointActuatorByName(name).input_start()] = effort
-    plant.get_actuation_input_port().FixValue(context, u)
-    start = plant.GetPositions(context)
-    simulator.AdvanceTo(1.0)
-    assert np.abs(plant.GetPositions(context) - start).max() < 1e-5
-    (loop,) = arm.loop_closures
-    gap = plant.GetFrameByName(loop.frame_a).CalcPose(context, plant.GetFrameByName(loop.frame_b)).translation()
-    assert np.linalg.norm(gap) < 1e-6
 
 
 def test_transmission_conserves_power(arm):
@@ -261,13 +180,6 @@ def test_sdf_friction_is_refused(tmp_path):
     )
     with pytest.raises(ArmError, match="joint j of the SDF has <friction>, which Drake ignores"):
         read_sdf_facts(compose_sdf([str(path)]))
-
-
-def test_arm_file_with_a_typo_is_refused(tmp_path):
-    path = tmp_path / "arm.yaml"
-    path.write_text("name: X\nmechanism: mtm\nposition_limit: {}\n")
-    with pytest.raises(ArmError, match="position_limit"):
-        load_arm(str(path))
 
 
 def test_keys_of_an_arm_file_replace_those_of_its_mechanism(tmp_path):

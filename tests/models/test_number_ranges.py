@@ -11,13 +11,14 @@ from typing import Union, get_args, get_origin, get_type_hints
 import numpy as np
 import pytest
 import yaml
+from arm_copies import copy_arm
 from command_output import refusal
 from schema_faults import schema_fault
 
 from dvrk_drake.analysis.excitation.pose_file import PoseFile
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, ModelFile
-from dvrk_drake.errors import ArmError, ControllerError, ModelError, ScenarioError, StationError
+from dvrk_drake.errors import ArmError, ControllerError, ModelError, ScenarioError
 from dvrk_drake.experiments.scenario import Scenario, load_scenario
 from dvrk_drake.experiments.study.study_file import Study
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
@@ -35,9 +36,8 @@ from dvrk_drake.models.arm_schema import (
 )
 from dvrk_drake.models.effects_schema import ArmEffects, FrictionEffect
 from dvrk_drake.models.ranges import RANGE, Range, number_fault, within
-from dvrk_drake.models.sdf_model import _RANGES, MODELS_FOLDER
+from dvrk_drake.models.sdf_model import _RANGES
 from dvrk_drake.processes.collector import CollectionSettings
-from dvrk_drake.processes.simulated_arm import load_driver
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 from dvrk_drake.systems.hand import Grip
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
@@ -194,24 +194,23 @@ def test_gains_are_compared_with_the_effort_limit_and_the_range():
 def own_psm(tmp_path):
     """Returns a function that writes modified files of a PSM and returns the path of the arm file."""
 
-    def write(changes=(), sdf=()):
-        for kind, name in (("arm", "psm"), ("mechanism", "psm"), ("instrument", "large_needle_driver")):
-            text = (MODELS_FOLDER / f"{kind}s" / f"{name}.yaml").read_text()
-            text = text.replace("mechanism: psm", "mechanism: mechanism.yaml")
-            text = text.replace("instrument: large_needle_driver", "instrument: instrument.yaml")
-            content = yaml.safe_load(text)
-            for file, keys, value in changes:
-                if file == kind:
-                    put(content, keys, value)
-            if kind == "mechanism":
-                content["sdf"] = "psm.sdf"
-            (tmp_path / f"{kind}.yaml").write_text(yaml.safe_dump(content))
-        text = (MODELS_FOLDER / "sdf/psm.sdf").read_text()
-        if sdf:
-            assert re.search(sdf[0], text, re.DOTALL)
-            text = re.sub(*sdf, text, count=1, flags=re.DOTALL)
-        (tmp_path / "psm.sdf").write_text(text)
-        return tmp_path / "arm.yaml"
+    def write(changes=(), sdf=None):
+        def with_values(kind):
+            def change(text):
+                content = yaml.safe_load(text)
+                for file, keys, value in changes:
+                    if file == kind:
+                        put(content, keys, value)
+                return yaml.safe_dump(content)
+
+            return change
+
+        def with_element(text):
+            assert sdf is None or re.search(sdf[0], text, re.DOTALL)
+            return text if sdf is None else re.sub(*sdf, text, count=1, flags=re.DOTALL)
+
+        kinds = ("arm", "mechanism", "instrument")
+        return copy_arm(tmp_path, "psm", **{kind: with_values(kind) for kind in kinds}, sdf=with_element)
 
     return write
 
@@ -341,21 +340,6 @@ def test_implausible_numbers_in_a_model_are_refused(key, value, message, tmp_pat
         IdentifiedModel.load(path)
     assert main(["export", "--model", str(path), "--sdf", str(tmp_path / "out.sdf")]) == 2
     assert refusal(capsys.readouterr().err)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("status_period: 1", r"status_period is 1; allowed: 0\.0005\.\.0\.01 s; is it in ms\?"),
-        ("guard: {expiry: 50}", r"guard\.expiry is 50; allowed: 0\.002\.\.1 s; is it in ms\?"),
-        ("guard: {margin: 3}", r"guard\.margin is 3; allowed: 0\.001\.\.0\.3 rad; is it in degrees\?"),
-    ],
-)
-def test_units_in_the_file_of_a_driver_are_checked(text, message, tmp_path):
-    path = tmp_path / "driver.yaml"
-    path.write_text(text)
-    with pytest.raises(StationError, match=rf"driver\.yaml: {message}"):
-        load_driver(path)
 
 
 def test_invalid_numbers_of_an_arm_made_in_python_are_refused():

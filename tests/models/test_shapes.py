@@ -2,23 +2,18 @@
 
 import json
 import re
-import xml.etree.ElementTree as ElementTree
 from base64 import b64decode
-from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pytest
 from pydrake.geometry import Role, SceneGraph
-from pydrake.multibody.parsing import Parser
-from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, DiscreteContactApproximation, MultibodyPlant
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RevoluteJoint
-from pydrake.systems.framework import DiagramBuilder
 
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import add_arm, make_arm_plant, set_arm_positions
-from dvrk_drake.models.sdf_elements import DRAKE
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, compose_sdf
 
 pytestmark = pytest.mark.drake_api
@@ -136,57 +131,6 @@ def test_shaft_and_cannula_pass_through_the_remote_centre(plant, psm_vertices):
             assert around.min() < 0.007
     shaft = psm_vertices["roll_link"]
     assert np.linalg.norm(shaft[:, :2], axis=1).max() == pytest.approx(0.0042, abs=2e-4)
-
-
-#: Pairs of links that touch although no joint of the tree connects them. The pin of the top bar is in the end link, and
-#: the instrument is in the cannula. The hubs of the fingers share a pin with both wrist links.
-NEIGHBOURS = (
-    {"top_bar_link", "end_link"},
-    {"end_link", "roll_link"},
-    *({"end_link", name} for name in ("wrist_pitch_link", "wrist_yaw_link", "finger_1_link", "finger_2_link")),
-    *({"wrist_pitch_link", name} for name in ("finger_1_link", "finger_2_link")),
-    {"wrist_yaw_link", "finger_2_link"},
-)
-
-
-def test_links_do_not_collide_within_the_joint_limits():
-    """Checks collisions without the collision filters of the arm. Drake ignores pairs of links that share a joint."""
-    arm = load_arm("psm")
-    root = compose_sdf(arm.sdf)
-    (model,) = root.findall("model")
-    for group in model.findall(f"{DRAKE}collision_filter_group"):
-        model.remove(group)
-    builder = DiagramBuilder()
-    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 1e-3)
-    plant.set_discrete_contact_approximation(DiscreteContactApproximation.kSap)
-    parser = Parser(plant)
-    parser.package_map().AddPackageXml(str(MODELS_FOLDER / "package.xml"))
-    parser.AddModelsFromString(ElementTree.tostring(root, encoding="unicode"), "sdf")
-    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base_link"))
-    plant.Finalize()
-    diagram = builder.Build()
-    context = diagram.CreateDefaultContext()
-    inspector, contacts = scene_graph.model_inspector(), set()
-    for q in np.vstack([box_corners(arm), np.random.default_rng(0).uniform(*limits(arm), (200, 7))]):
-        set_arm_positions(plant, plant.GetMyMutableContextFromRoot(context), arm, q)
-        query = scene_graph.get_query_output_port().Eval(scene_graph.GetMyContextFromRoot(context))
-        for pair in query.ComputePointPairPenetration():
-            frames = [inspector.GetFrameId(geometry) for geometry in (pair.id_A, pair.id_B)]
-            contacts.add(frozenset(plant.GetBodyFromFrameId(frame).name() for frame in frames))
-    assert contacts <= set(map(frozenset, NEIGHBOURS))
-    assert frozenset({"top_bar_link", "end_link"}) in contacts
-
-
-def limits(arm):
-    """Returns the lower and upper limits (7,). For the jaw, the lower limit is the closed jaw."""
-    return np.append(arm.position_lower[:6], 0.0), arm.position_upper
-
-
-def box_corners(arm):
-    """Returns the poses (8, 7) at the corners of the limits of yaw, pitch and insertion. The other positions are 0."""
-    corners = np.zeros((8, 7))
-    corners[:, :3] = list(product(*zip(arm.position_lower[:3], arm.position_upper[:3], strict=True)))
-    return corners
 
 
 def test_instrument_adds_only_shapes_to_links_of_the_arm(tmp_path):

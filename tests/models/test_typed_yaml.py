@@ -3,30 +3,16 @@
 from dataclasses import dataclass, field
 
 import pytest
+from arm_copies import copy_arm
 from pydrake.common.yaml import yaml_load_typed
 from schema_faults import schema_fault
 
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL
+from dvrk_drake.models.sdf_model import MODELS_FOLDER
 from dvrk_drake.models.typed_yaml import load_typed_yaml, parse_yaml, typed_content
 
 pytestmark = pytest.mark.drake_api
-
-
-def own_psm(folder):
-    """Writes the three files of a PSM into `folder`."""
-    for kind, name in (("arm", "psm"), ("mechanism", "psm"), ("instrument", "large_needle_driver")):
-        text = (MODELS_FOLDER / f"{kind}s" / f"{name}.yaml").read_text()
-        text = text.replace("mechanism: psm", "mechanism: mechanism.yaml")
-        (folder / f"{kind}.yaml").write_text(
-            text.replace("instrument: large_needle_driver", "instrument: instrument.yaml")
-        )
-    return folder / "arm.yaml"
-
-
-def test_the_files_themselves_are_read(tmp_path):
-    assert PACKAGE_URL in load_arm(str(own_psm(tmp_path))).sdf[0]
 
 
 @pytest.mark.parametrize(
@@ -76,7 +62,7 @@ def test_the_files_themselves_are_read(tmp_path):
     ],
 )
 def test_error_names_file_and_accepted_values(file, change, message, tmp_path):
-    arm, path = own_psm(tmp_path), tmp_path / f"{file}.yaml"
+    arm, path = copy_arm(tmp_path, "psm"), tmp_path / f"{file}.yaml"
     text = path.read_text()
     assert change[0] in text
     path.write_text(text.replace(*change, 1))

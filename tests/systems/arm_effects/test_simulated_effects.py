@@ -4,6 +4,7 @@ import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 import pytest
+from arm_copies import copy_arm
 from simulated_effects import ARMS
 
 from dvrk_drake.dynamics.kinematics import ArmFrame
@@ -50,9 +51,6 @@ def test_gravity_controller_holds_arm_with_effects(name):
 def test_unknown_part_is_an_error(tmp_path):
     with pytest.raises(ScenarioError, match="simulated arm: unknown effect frction"):
         load_scenario("mtml", ["simulated_effects=[frction]"])
-    text = (MODELS_FOLDER / "mechanisms" / "mtm.yaml").read_text()
-    arm_text = (MODELS_FOLDER / "arms" / "mtml.yaml").read_text().replace("mechanism: mtm", "mechanism: m.yaml")
-    (tmp_path / "a.yaml").write_text(arm_text)
     for old, new, message in (
         ("stops: true", "stopps: true", "stopps"),
         ("outer_yaw: 1.861", "outer_jaw: 1.861", "effects.saturation: unknown actuator outer_jaw"),
@@ -70,11 +68,11 @@ def test_unknown_part_is_an_error(tmp_path):
         ("scale: 0.015", "scale: 0.0", "scale is 0; allowed for kind presliding: a positive number"),
         ("coefficient: 0.0011", "coefficient: -0.0011", "coefficient is -0.0011; allowed for kind presliding: 0"),
     ):
-        assert old in text
-        (tmp_path / "m.yaml").write_text(text.replace(old, new))
-        load_arm.__globals__["_load_arm"].cache_clear()
+        folder = tmp_path / message
+        folder.mkdir()
+        path = copy_arm(folder, "mtml", mechanism=lambda text, old=old, new=new: text.replace(old, new))
         with pytest.raises(ArmError, match=message):
-            load_arm(str(tmp_path / "a.yaml"))
+            load_arm(path)
 
 
 def test_unknown_coordinate_is_refused():

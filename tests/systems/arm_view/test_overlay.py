@@ -5,13 +5,13 @@ import threading
 
 import numpy as np
 import pytest
+from arm_copies import copy_arm
 from forked import run_forked
 
 import dvrk_drake as dvrk
 from dvrk_drake.errors import ArmError, DvrkDrakeError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import set_arm_positions, shared_plant
-from dvrk_drake.models.sdf_model import MODELS_FOLDER
 from dvrk_drake.systems.arm_view import page
 from dvrk_drake.systems.arm_view.efforts import LEVELS, axis_frames
 from dvrk_drake.systems.arm_view.overlay import ArmOverlay
@@ -123,11 +123,6 @@ def test_drawing_does_not_change_a_simulation():
 
 
 def test_unknown_frames_in_the_arm_file_are_refused(tmp_path):
-    mechanism = (
-        (MODELS_FOLDER / "mechanisms/psm.yaml").read_text().replace("remote_center: dh_0", "remote_center: dh_x")
-    )
-    (tmp_path / "mechanism.yaml").write_text(mechanism)
-    arm = (MODELS_FOLDER / "arms/psm.yaml").read_text().replace("mechanism: psm", "mechanism: mechanism.yaml")
-    (tmp_path / "arm.yaml").write_text(arm)
+    path = copy_arm(tmp_path, "psm", mechanism=lambda text: text.replace("remote_center: dh_0", "remote_center: dh_x"))
     with pytest.raises(ArmError, match=r"frames\.remote_center: the SDF has no frame dh_x"):
-        load_arm(tmp_path / "arm.yaml")
+        load_arm(path)

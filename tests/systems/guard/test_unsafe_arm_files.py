@@ -4,35 +4,39 @@ import dataclasses
 import re
 
 import pytest
+from arm_copies import copy_arm
 
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm_files import known_arms, load_arm
 from dvrk_drake.models.linear_map import LinearMap
-from dvrk_drake.models.sdf_model import MODELS_FOLDER, local_path
+from dvrk_drake.models.sdf_model import MODELS_FOLDER
 from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.guard.unsafe_arm import unsafe_difference
 
 PSM = load_arm("psm")
 YAW = "wrist_yaw: [-0.785398, 0.785398]"
-ARM = (MODELS_FOLDER / "arms" / "mtml.yaml").read_text() + f"position_limits: {{{YAW}}}\n"
 MECHANISM = (MODELS_FOLDER / "mechanisms" / "mtm.yaml").read_text()
-URL = "package://dvrk_drake/sdf/mtml.sdf"
-SDF = local_path(URL)
+SDF = MODELS_FOLDER / "sdf" / "mtml.sdf"
 
 
 def mtml(folder, *, arm=(), mechanism=(), sdf=(), name="MTML"):
     """Returns an MTML whose files contain replacements (old, new) of texts."""
-    texts = {"arm": ARM, "mechanism": MECHANISM, "sdf": SDF.read_text()}
-    for key, replacements in (("arm", arm), ("mechanism", mechanism), ("sdf", sdf)):
+
+    def replaced(text, replacements):
         for old, new in replacements:
-            assert old in texts[key]
-            texts[key] = texts[key].replace(old, new, 1)
-    arm_text = texts["arm"].replace("mechanism: mtm", "mechanism: mechanism.yaml")
-    arm_text = arm_text.replace("name: MTML", f"name: {name}")
-    (folder / "arm.yaml").write_text(arm_text.replace(URL, "mtml.sdf"))
-    (folder / "mechanism.yaml").write_text(texts["mechanism"])
-    (folder / "mtml.sdf").write_text(texts["sdf"])
-    return load_arm(folder / "arm.yaml")
+            assert old in text
+            text = text.replace(old, new, 1)
+        return text
+
+    limits = f"position_limits: {{{YAW}}}\n"
+    path = copy_arm(
+        folder,
+        "mtml",
+        arm=lambda text: replaced(text + limits, arm).replace("name: MTML", f"name: {name}"),
+        mechanism=lambda text: replaced(text, mechanism),
+        sdf=lambda text: replaced(text, sdf),
+    )
+    return load_arm(path)
 
 
 HINT = "as for the arm MTML of dvrk_drake; correct the file, or give the arm another name"
