@@ -78,8 +78,8 @@ def control(
         connection = connect_arm(controlled, Dialog(report=print_line))
     if mode == "guide" and not is_cross_validated(connection.model):
         print_warning(
-            "the error of the model at rest is unknown, because it was not identified from static poses; virtual "
-            "friction holds the arm only up to the dry friction of the arm file"
+            "the error of the model is unknown, because it was not identified from a recording; virtual friction holds "
+            "the arm only up to the dry friction of the arm file"
         )
     name = connection.arm.name
     line, printed = LiveLine(sys.stderr), [("", "")]

@@ -71,8 +71,9 @@ class GravityPidController(LeafSystem):
     its slip effort, at which it slides. It breaks away 8 mrad from its place, or when a hand moves two joints faster
     than 50 mrad/s, and the joint is free until it rests again. Each spring is passive: it returns at most the energy
     with which the hand deflected it. Damping acts in addition. On a free joint, it acts up to the error of the model,
-    and only below 50 mrad/s. All springs detach if a measurement is not valid, if the position jumps, and in all other
-    modes. Their efforts then decay with a time constant of 20 ms.
+    and only below 50 mrad/s. At the change from "hold" mode, the springs take over the effort of the regulator, up to
+    the slip effort. All springs detach if a measurement is not valid, if the position jumps, and in all other modes.
+    Their efforts then decay with a time constant of 20 ms.
 
     .. pydrake_system::
 

@@ -8,7 +8,7 @@ import numpy as np
 from dvrk_drake.dynamics.compiled import compiled_for, read_only
 from dvrk_drake.dynamics.holding_torque import HOLDING, holding_torque_into
 from dvrk_drake.models.arm_schema import IMPLAUSIBLE
-from dvrk_drake.systems.virtual_friction import detach, virtual_friction
+from dvrk_drake.systems.virtual_friction import attach, detach, virtual_friction
 
 #: Values of `mode`: indices into `gravity_pid_controller.Mode`.
 HOLD, GRAVITY, DAMPED, GUIDE = 0, 1, 2, 3
@@ -65,9 +65,13 @@ def controller_step(
         for i in range(n):
             latched_q[i], last_q[i], integral[i] = np.nan, np.nan, 0.0
         springs[:] = 0.0
+        springs[3 * n : 4 * n] = np.nan  # the filtered positions are unknown
     faulty = False
     for i in range(2 * n):
         faulty |= not abs(state[i]) < IMPLAUSIBLE  # also true for NaN
+    held = not np.isnan(latched_q[0])
+    if mode == GUIDE and held and not (restart or faulty):
+        attach(gravity, effort, slip, springs)
     effort[:] = 0.0
     if faulty:
         detach(period, springs, effort)

@@ -69,9 +69,12 @@ def virtual_friction(
     gain, rate_gain = period / (FILTER_TIME + period), period / (RATE_TIME + period)
     for i in range(n):
         step = q[i] - last_q[i]
-        if np.isnan(first[i]) or not abs(step) <= jump[i] + 2.0 * period * abs(v[i]):  # also for NaN
+        unknown = np.isnan(first[i])
+        if unknown or not abs(step) <= jump[i] + 2.0 * period * abs(v[i]):  # also for NaN
             step, first[i], second[i] = 0.0, q[i], q[i]
             place[i], rested[i], rate[i] = np.nan, 0.0, 0.0
+            if unknown and abs(v[i]) * FILTER_TIME <= rest[i]:
+                rested[i] = REST_TIME  # an arm that does not move at the start was at rest before
         spring[i] += stiffness[i] * step
         rate[i] += rate_gain * (step / period - rate[i])
         first[i] += gain * (q[i] - first[i])
@@ -109,3 +112,21 @@ def detach(period, memory, effort):  # pragma: no cover - compiled
         for k in (i, n + i):
             memory[k] *= 1.0 - min(period / DECAY_TIME, 1.0)
         effort[i] -= memory[i]
+
+
+@compiled
+def attach(gravity, effort, slip, memory):  # pragma: no cover - compiled
+    """Transfers the effort of a regulator to the springs, at the change from mode "hold" to "guide".
+
+    The effort of the joint then has no step, and friction that the regulator held cannot push the joint away. The
+    spring of a joint that does not rest decays, see `virtual_friction`.
+
+    Args:
+        gravity, effort: Gravity effort and effort (n,) of the last period in mode "hold".
+        slip: Efforts (n,) at which the springs slide.
+        memory: State (7 n,), see `NUM_STATES`.
+    """
+    n = effort.size
+    for i in range(n):
+        memory[i] = min(max(gravity[i] - effort[i], -slip[i]), slip[i])
+        memory[n + i] = 1.0

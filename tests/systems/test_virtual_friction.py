@@ -6,11 +6,13 @@ from statistics import NormalDist
 import numpy as np
 import pytest
 
+from dvrk_drake.dynamics.dynamic_section import ActuatorStatistics
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.slip_effort import MAX_SLIP_SHARE, is_cross_validated, slip_effort
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.arm_schema import Gains
+from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 from dvrk_drake.systems.virtual_friction import DECAY_TIME, NUM_STATES, REST_TIME, virtual_friction
 
@@ -29,16 +31,17 @@ Q = 0.5 * (ARM.position_lower + ARM.position_upper)
 class Guided:
     """Controller in mode "guide" and the effort that it adds to gravity."""
 
-    def __init__(self, model=MODEL, kd=KD, **arguments):
+    def __init__(self, model=MODEL, kd=KD, v=1.0, **arguments):
         gains = Gains(kp=KP.tolist(), kd=np.broadcast_to(kd, N).tolist(), ki=[0.0] * N)
         arguments = {"slip_efforts": SLIP, **arguments}
         self.controller = GravityPidController(model, mode="guide", gains=gains, **arguments)
         self.context = self.controller.CreateDefaultContext()
         self.added = np.zeros(N)
-        self.measure(Q)
+        self.measure(Q, v)
         self.controller.ExecuteInitializationEvents(self.context)
 
     def measure(self, q, v=0.0):
+        self.measured = q
         state = np.concatenate([q, np.broadcast_to(v, N)])
         self.controller.GetInputPort("state_estimated").FixValue(self.context, state)
 
@@ -186,6 +189,24 @@ def test_damping_of_a_free_joint_covers_the_model_error():
     assert_no_effort(Guided(slip_efforts=ARM.dry_friction() + error).move(Q + 0.1, 0.1).added)
 
 
+def test_spring_attaches_at_the_start_of_an_arm_at_rest():
+    guided, moved = Guided(kd=0.0, v=0.0), 0.5 * SLIP / KP
+    guided.step(Q)
+    np.testing.assert_allclose(guided.step(Q + moved), -0.5 * SLIP, atol=1e-12)
+
+
+def test_springs_take_over_the_effort_of_the_regulator():
+    guided = Guided(kd=0.0)
+    guided.controller.SetMode(guided.context, "hold")
+    guided.rest()
+    guided.move(Q + np.where(np.arange(N) % 2, 0.5, -1.5) * SLIP / KP, 0.01).rest(guided.measured, 0.6)
+    regulated = guided.added
+    guided.controller.SetMode(guided.context, "guide")
+    taken = np.clip(regulated, -SLIP, SLIP)
+    np.testing.assert_allclose(guided.step(guided.measured), taken, atol=1e-9)
+    np.testing.assert_allclose(guided.rest(guided.measured).added, taken, atol=0.05 * SLIP.max())
+
+
 def test_damping_of_an_attached_joint_is_at_most_the_slip_effort():
     np.testing.assert_allclose(Guided(kd=ARM.effort_limits).rest().step(Q + 1e-3), -SLIP - 1e-3 * KP, atol=1e-12)
 
@@ -230,6 +251,20 @@ def test_default_slip_effort_covers_the_error_and_the_friction():
     np.testing.assert_allclose(slip_effort(model), dry + NormalDist().inv_cdf(0.975) * error, atol=1e-9)
     joints[0] = dataclasses.replace(joints[0], rms_cross_validation_included=10.0)
     assert slip_effort(dataclasses.replace(MODEL, joints=joints))[0] == MAX_SLIP_SHARE * ARM.effort_limits[0]
+
+
+def test_default_slip_effort_of_a_model_of_motions_covers_its_error_in_motion():
+    error, J = 0.01 * ARM.effort_limits, ARM.transmission.matrix
+    model = IdentifiedModel.from_arm(ARM, dynamics=True)
+    actuators = [
+        ActuatorStatistics(name, rms_cross_validation=e) for name, e in zip(ARM.joint_names, error, strict=True)
+    ]
+    offset = DriveEffect(f"actuator.{ARM.joint_names[1]}", "offset", coefficient=0.1)  # of a joint that carries weight
+    dynamics = dataclasses.replace(model.dynamics, actuators=actuators, effects=[*model.dynamics.effects, offset])
+    model = dataclasses.replace(model, dynamics=dynamics)
+    assert is_cross_validated(model)
+    expected = NormalDist().inv_cdf(0.975) * np.sqrt((J.T**2) @ error**2) + np.abs(0.1 * J[1])
+    np.testing.assert_allclose(slip_effort(model) - ARM.dry_friction(), expected, atol=1e-9)
 
 
 @pytest.mark.parametrize("slip", [-1.0, np.nan, 0.5 * ARM.effort_limits[0]])
