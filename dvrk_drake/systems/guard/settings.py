@@ -24,6 +24,7 @@ _WEAKER_IF_SMALLER = frozenset(
         "traverse_time",
         "oscillation_time",
         "frozen_speed",
+        "frozen_deflection",
         "response_memory",
         "detection_time",
     }
@@ -47,12 +48,18 @@ class PlausibilitySettings:
             velocity is estimated from the time between two counts, because the estimate is constant until the next
             count.
         velocity_memory: Time constant of the comparison of positions and velocities [s].
-        frozen_effort: Change of effort that must cause a change of position, as a fraction of the effort limit.
-        frozen_time: Longest time for which a position may stay constant after such a change of effort [s].
+        velocity_scale: Allowed relative error of the velocity.
+        frozen_effort: Change of effort that must cause a change of position, as a fraction of the effort limit. The
+            effort for one encoder count is added.
+        frozen_deflection: Deflection that the full effort limit causes at least if the joint is blocked [rad]. For a
+            prismatic joint, the deflection in m is 0.1 times this value.
+        frozen_time: Longest time for which a position may stay constant after such a change of effort [s]. It exceeds
+            `zero_time`, so that an effort sensor that fails does not look like a stuck encoder.
         frozen_speed: Lowest expected speed of a moving joint [rad/s, m/s]. The time in which a joint moves by one
             encoder count at this speed is added to `frozen_time`.
         response: Allowed unexplained effort as a fraction of the effort limit, in addition to `hand_effort`. See
-            `plausibility.Response`.
+            `check_effort.Response`.
+        opposed_effort: Allowed effort against which a joint accelerates, as a fraction of the effort limit.
         hand_effort: Allowed effort of the operator's hand or of a model error on a joint [N m]. For a prismatic joint,
             the allowed effort in N is ten times this value.
         response_time: Time constant of the filters of effort and acceleration [s].
@@ -61,8 +68,11 @@ class PlausibilitySettings:
         start_gravity: Allowed difference between the measured effort and the gravity effort when effort commands start,
             as a fraction of the effort limit. The arm's dry friction and `hand_effort` are added to the allowed
             difference.
-        silent_effort: Lowest commanded effort that the measured effort must follow, as a fraction of the effort limit.
-        silent_time: Time within which the measured effort must follow the commanded effort [s].
+        tracking_error: Allowed difference between measured and commanded effort, as a fraction of the effort limit.
+        tracking_scale: Allowed difference as a fraction of the commanded effort, which is added.
+        tracking_time: Time constant of the filter of this difference [s]. While the commanded effort changes by the
+            effort limit, a measurement that is 10 ms old causes a difference of 10 ms / `tracking_time` of the limit.
+        zero_time: Longest time for which a measured effort may be exactly zero, although an effort is commanded [s].
         detection_time: Longest expected time from an error to its detection [s]. Positions that were measured during
             this time before the detection are not used as last valid positions.
         bad_samples: Largest number of consecutive measurements that may be late or not finite while the arm holds.
@@ -73,16 +83,21 @@ class PlausibilitySettings:
     velocity_delay: float = field(default=0.03, metadata=within(0.001, 0.1, "s"))
     velocity_counts: float = field(default=150.0, metadata=within(0.0, 2000.0, "1/s"))
     velocity_memory: float = field(default=0.15, metadata=within(0.05, 2.0, "s"))
-    frozen_effort: float = field(default=0.45, metadata=within(0.05, 1.0))
-    frozen_time: float = field(default=0.01, metadata=within(0.002, 1.0, "s"))
+    velocity_scale: float = field(default=0.15, metadata=within(0.0, 1.0))
+    frozen_effort: float = field(default=0.15, metadata=within(0.02, 1.0))
+    frozen_deflection: float = field(default=0.02, metadata=within(0.001, 1.0, "rad"))
+    frozen_time: float = field(default=0.03, metadata=within(0.002, 1.0, "s"))
     frozen_speed: float = field(default=0.1, metadata=within(0.001, 10.0, "rad/s"))
     response: float = field(default=1.3, metadata=within(0.2, 5.0))
     hand_effort: float = field(default=0.06, metadata=within(0.0, 5.0, "N m"))
+    opposed_effort: float = field(default=0.15, metadata=within(0.05, 5.0))
     response_time: float = field(default=0.03, metadata=within(0.005, 0.5, "s"))
     response_memory: float = field(default=0.2, metadata=within(0.02, 10.0, "s"))
     start_gravity: float = field(default=0.1, metadata=within(0.02, 2.0))
-    silent_effort: float = field(default=0.3, metadata=within(0.05, 1.0))
-    silent_time: float = field(default=0.02, metadata=within(0.002, 1.0, "s"))
+    tracking_error: float = field(default=0.1, metadata=within(0.01, 1.0))
+    tracking_scale: float = field(default=0.25, metadata=within(0.0, 1.0))
+    tracking_time: float = field(default=0.1, metadata=within(0.01, 1.0, "s"))
+    zero_time: float = field(default=0.02, metadata=within(0.002, 1.0, "s"))
     detection_time: float = field(default=0.03, metadata=within(0.005, 0.5, "s"))
     bad_samples: int = field(default=20, metadata=within(0, 100))
 

@@ -145,6 +145,9 @@ def test_inconsistent_velocity_is_found(joint, speed, measured, relative):
     seen = abs(factor * speed)
     T = SETTINGS.velocity_memory
     allowed = TOLERANCE[joint] + T * SETTINGS.velocity_counts * COUNTS[joint] + SETTINGS.velocity_delay * seen
+    if measured != "stuck" and joint >= N - 3:  # a coarse encoder, whose position also changes
+        scale = SETTINGS.velocity_delay + SETTINGS.velocity_scale * T
+        allowed = min(allowed, TOLERANCE[joint] + 3 * COUNTS[joint] + scale * seen)
     if allowed > 0.99 * relative * abs(speed) * T:  # a coarse encoder at a low speed
         assert (fault, COUNTS[joint] > 1e-3) == ("", True)
         return
@@ -156,7 +159,7 @@ def test_inconsistent_velocity_is_found(joint, speed, measured, relative):
 @pytest.mark.parametrize(
     ("arm", "smallest"),
     [
-        (ARM, [0.073, 0.073, 0.078, 0.100, 0.57, 0.57, 1.07]),
+        (ARM, [0.073, 0.073, 0.078, 0.100, 0.185, 0.185, 0.304]),
         (PSM, [0.068, 0.068, 0.0070, 0.103, 0.090, 0.115, 0.124]),
     ],
 )
@@ -184,10 +187,11 @@ def test_filtered_velocity_is_plausible():
 @pytest.mark.parametrize("side", [-1, 1])
 def test_constant_position_under_changing_effort_is_frozen(joint, side):
     time = SETTINGS.frozen_time + COUNTS[joint] / SETTINGS.frozen_speed
+    share = SETTINGS.frozen_effort + COUNTS[joint] / SETTINGS.frozen_deflection
     for factor, found in ((0.99, False), (1.01, True)):
         sensors = Sensors()
         sensors.move(np.zeros(N), ticks=1000)  # the joint was at rest before
-        sensors.effort = unit(joint, side * factor * SETTINGS.frozen_effort * LIMIT[joint])
+        sensors.effort = unit(joint, side * factor * share * LIMIT[joint])
         fault, ticks = sensors.move(np.zeros(N), ticks=500)
         assert ("does not change although" in fault) == found
         np.testing.assert_array_equal(sensors.checks.invalid, unit(joint).astype(bool) & found)
@@ -205,10 +209,11 @@ def test_effort_after_power_on_is_plausible():
 
 def test_joint_moving_by_a_count_is_not_frozen():
     sensors = Sensors()
-    start = sensors.q.copy()
+    start, share = sensors.q.copy(), SETTINGS.frozen_effort + COUNTS / SETTINGS.frozen_deflection
     for k in range(1000):
-        sensors.effort = 0.9 * LIMIT * np.sin(0.005 * k)
-        sensors.q = start + COUNTS * np.round(2.4 * np.sin(0.005 * k))
+        effort = 0.9 * np.sin(0.005 * k)
+        sensors.effort = effort * LIMIT
+        sensors.q = start + COUNTS * np.round(1.1 * effort / share)
         assert sensors.measure() == ""
 
 
@@ -222,20 +227,39 @@ def test_gravity_of_moving_joints_freezes_no_other_joint():
         assert sensors.measure(v=v) == ""
 
 
+class Light(Weightless):
+    """Model whose joints accelerate by 300 rad/s^2 at their effort limits."""
+
+    def mass_matrix(self, q):
+        return np.diag(LIMIT / 300.0)
+
+
 @pytest.mark.parametrize("joint", JOINTS)
-def test_motion_inconsistent_with_effort_is_found(joint):
-    """With unit inertia, the full effort accelerates the joint in the wrong direction (inverted encoder)."""
-    strong = SETTINGS.hand_effort < 0.1 * LIMIT[joint]  # on weaker joints, the error is within the allowed hand effort
-    for sign, found in ((1, False), (-1, strong)):
-        sensors = Sensors(model=Unity())
-        sensors.effort = unit(joint, LIMIT[joint])
-        fault = ""
-        for _ in range(100):
-            sensors.v = sensors.v + sign * MS * sensors.effort
-            sensors.q = sensors.q + MS * sensors.v
-            fault = fault or sensors.measure()
-        assert (fault == f"{ARM.joint_names[joint]}: the motion does not follow from the effort") == found
+@pytest.mark.parametrize(("effort", "friction"), [(1.0, 0.0), (0.7, 0.1), (0.14, 0.0)])
+def test_acceleration_against_the_effort_is_found(joint, effort, friction):
+    """Inverted encoder. Friction reduces the acceleration."""
+    for sign, found in ((1, False), (-1, effort > SETTINGS.opposed_effort)):
+        sensors, fault, ticks = Sensors(model=Light()), "", 0
+        sensors.effort = unit(joint, effort * LIMIT[joint])
+        while not fault and ticks < 100:
+            sensors.v = sensors.v + sign * MS * 300.0 * unit(joint, effort - friction)
+            sensors.q, ticks = sensors.q + MS * sensors.v, ticks + 1
+            fault = sensors.measure()
+        assert fault == f"{ARM.joint_names[joint]}: the motion does not follow from the effort" * found
         assert sensors.checks.invalid[joint] == found
+        assert not found or ticks < 60
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.4, 0.8])
+def test_held_joint_may_be_shaken(damping):
+    """A hand moves a joint at 4 Hz against a spring and a damper. The inertial effort is 0.6 of the limit."""
+    sensors, omega = Sensors(model=Light()), 8 * np.pi
+    for k in range(1000):
+        phase = omega * MS * k
+        sensors.v = 180.0 / omega * min(phase / 6, 1.0) * np.sin(phase) * np.ones(N)
+        sensors.q = sensors.q + MS * sensors.v
+        sensors.effort = LIMIT * (0.4 * np.cos(phase) - damping * np.sin(phase)) * min(phase / 6, 1.0)
+        assert sensors.measure() == "", k
 
 
 def test_slowly_growing_model_error_is_accepted():
@@ -247,18 +271,47 @@ def test_slowly_growing_model_error_is_accepted():
 
 
 @pytest.mark.parametrize("joint", JOINTS)
-@pytest.mark.parametrize("measured", [0.0, -0.5])
-def test_missing_measured_effort_is_found(joint, measured):
-    for commanded, found in ((0.29, False), (0.31, True), (-0.31, True)):
+@pytest.mark.parametrize(("commanded", "measured"), [(0.3, -0.5), (-0.4, 0.2), (0.4, 1.6), (0.4, 0.6), (0.1, -0.1)])
+def test_wrong_measured_effort_is_found(joint, commanded, measured):
+    sensors, difference = Sensors(), abs(commanded * (1 - measured))
+    sensors.commanded = unit(joint, commanded * LIMIT[joint])
+    sensors.effort = measured * sensors.commanded + 1e-9
+    fault, ticks = sensors.move(COUNTS / MS, ticks=400)
+    allowed = SETTINGS.tracking_error + SETTINGS.tracking_scale * abs(commanded)
+    assert not sensors.checks.invalid.any()  # the position is valid
+    if difference < allowed:
+        assert fault == ""
+        return
+    assert fault == f"{ARM.joint_names[joint]}: the measured effort does not follow the commanded effort"
+    assert MS * ticks == pytest.approx(-SETTINGS.tracking_time * np.log(1 - allowed / difference), abs=2 * MS)
+
+
+@pytest.mark.parametrize("joint", JOINTS)
+def test_effort_of_exactly_zero_is_found(joint):
+    for commanded, found in ((0.019, False), (0.021, True), (-0.021, True)):
         sensors = Sensors()
         sensors.commanded = unit(joint, commanded * LIMIT[joint])
-        sensors.effort = measured * sensors.commanded
-        fault, ticks = sensors.move(np.zeros(N), ticks=100)
-        text = f"{ARM.joint_names[joint]}: the measured effort does not follow the commanded effort"
-        assert (fault == text) == found
-        assert not sensors.checks.invalid.any()  # the position is valid
-        if found:
-            assert MS * ticks == pytest.approx(SETTINGS.silent_time, abs=1.5 * MS)
+        fault, ticks = sensors.move(COUNTS / MS, ticks=100)
+        assert ("does not follow the commanded" in fault) == found
+        assert not found or MS * ticks == pytest.approx(SETTINGS.zero_time, abs=1.5 * MS)
+
+
+@pytest.mark.parametrize("is_commanded", [False, True])
+def test_failed_effort_sensor_keeps_the_position_valid(is_commanded):
+    """A failed effort sensor looks like a change of effort without a change of position."""
+    sensors = Sensors()
+    sensors.effort = 0.4 * LIMIT
+    sensors.checks.forget()
+    sensors.commanded = sensors.effort if is_commanded else None
+    assert sensors.move(np.zeros(N), ticks=400)[0] == ""
+    sensors.effort = np.zeros(N)
+    faults = [sensors.move(np.zeros(N))[0] for _ in range(400)]
+    assert set(faults) <= {
+        "",
+        f"{', '.join(ARM.joint_names)}: the measured effort does not follow the commanded effort",
+    }
+    assert any(faults) == is_commanded
+    assert not sensors.checks.invalid.any()
 
 
 def test_effort_in_hold_is_not_compared():
@@ -266,7 +319,7 @@ def test_effort_in_hold_is_not_compared():
     sensors = Sensors()
     for _ in range(10):
         sensors.commanded = unit(0, 0.9 * LIMIT[0])
-        assert sensors.move(np.zeros(N), ticks=round(0.7 * SETTINGS.silent_time / MS))[0] == ""
+        assert sensors.move(np.zeros(N), ticks=round(0.7 * SETTINGS.zero_time / MS))[0] == ""
         sensors.commanded = None
         assert sensors.move(np.zeros(N), ticks=1)[0] == ""
 
@@ -297,7 +350,7 @@ def test_delayed_measured_effort_is_plausible():
     sensors = Sensors()
     for k in range(500):
         sensors.commanded = 0.9 * LIMIT * np.sin(0.02 * k)
-        sensors.effort = 0.9 * LIMIT * np.sin(0.02 * (k - 5))
+        sensors.effort = 0.9 * LIMIT * np.sin(0.02 * (k - 5) * (k > 5))
         assert sensors.move(COUNTS / MS)[0] == ""
 
 
@@ -341,7 +394,7 @@ def test_invalid_joint_gets_gravity_effort_others_are_held(mode, joint):
 
 
 @pytest.mark.parametrize(
-    ("name", "file"), [("mtml", "mtm_one.csv"), ("psm", "psm_one.csv"), ("psm", "psm_one_205g_insertion.csv")]
+    ("name", "file"), [("mtml", "mtm_one.csv"), ("mtmr", "mtm_earlier_day.csv"), ("psm", "psm_one_205g_insertion.csv")]
 )
 def test_no_false_alarms_on_recordings_of_real_arms(shared_data, name, file):
     """No check finds a fault with the nominal model at 200 Hz, despite model errors and late rows."""
@@ -408,7 +461,6 @@ def test_saturated_coupled_actuators_are_plausible():
     """The full elbow effort also loads the shoulder's actuator, which saturates: tau_2 = 1.464 - 1.753."""
     sensors = Sensors()
     sensors.commanded = np.array([0.0, 0.35, -1.0, 0.0, 0.0, 0.0, 0.0]) * LIMIT
-    assert sensors.commanded[1] > SETTINGS.silent_effort * LIMIT[1]
     sensors.effort = np.array([0.0, 1.464 - 1.753, -1.753, 0.0, 0.0, 0.0, 0.0])
     assert sensors.move(COUNTS / MS, ticks=200)[0] == ""
     # A measured effort of zero is still detected if the actuators can apply the effort.
