@@ -21,6 +21,10 @@ _POWER_ON = 0.25
 #: number, the largest difference in recordings of a real MTM, whose wrist has coarse encoders, is 0.7 of the tolerance.
 _ROUNDING_COUNTS = 3.0
 
+#: Largest change of effort without a change of position on a coarse encoder, as a fraction of the effort limit. In
+#: normal use of the simulated MTM, the effort of the wrist yaw changes by 0.3 of its limit before the next count.
+_LARGEST_FROZEN_EFFORT = 0.45
+
 
 class PositionJump(Check):
     """Check for impossible position steps: |dq| > tolerance + (dt + jitter) min(|v|, 1.5 speed limit)."""
@@ -109,7 +113,8 @@ class FrozenPosition(Check):
     def __init__(self, settings: PlausibilitySettings, arm: Arm, counts: Vector) -> None:
         """Creates the check for the joints of `arm` with encoder counts (n,) [rad, m]."""
         deflection = arm.per_joint(settings.frozen_deflection, 0.1 * settings.frozen_deflection)
-        self._allowed = (settings.frozen_effort + counts / deflection) * arm.effort_limits
+        share = np.minimum(settings.frozen_effort + counts / deflection, _LARGEST_FROZEN_EFFORT)
+        self._allowed = np.maximum(share, settings.frozen_effort) * arm.effort_limits
         self._least_time = settings.frozen_time + counts / settings.frozen_speed
 
     def begin(self, sample: Sample) -> None:

@@ -85,7 +85,7 @@ class PlausibilitySettings:
     velocity_memory: float = field(default=0.15, metadata=within(0.05, 2.0, "s"))
     velocity_scale: float = field(default=0.15, metadata=within(0.0, 1.0))
     frozen_effort: float = field(default=0.15, metadata=within(0.02, 1.0))
-    frozen_deflection: float = field(default=0.02, metadata=within(0.001, 1.0, "rad"))
+    frozen_deflection: float = field(default=0.01, metadata=within(0.001, 1.0, "rad"))
     frozen_time: float = field(default=0.03, metadata=within(0.002, 1.0, "s"))
     frozen_speed: float = field(default=0.1, metadata=within(0.001, 10.0, "rad/s"))
     response: float = field(default=1.3, metadata=within(0.2, 5.0))

@@ -289,7 +289,7 @@ PLAUSIBILITY_SETTINGS = {
     "velocity_memory": (0.05, 0.15, 2.0),
     "velocity_scale": (0.0, 0.15, 1.0),
     "frozen_effort": (0.02, 0.15, 1.0),
-    "frozen_deflection": (0.001, 0.02, 1.0),
+    "frozen_deflection": (0.001, 0.01, 1.0),
     "frozen_time": (0.002, 0.03, 1.0),
     "frozen_speed": (0.001, 0.1, 10.0),
     "response": (0.2, 1.3, 5.0),
