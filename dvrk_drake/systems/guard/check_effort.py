@@ -32,9 +32,9 @@ class Response(Check):
 
     - The unexplained effort |x - y| contains friction, external forces, model errors, and errors of sensors or motors.
     - The opposed effort is (|x - y| - 3 |x + y|) / 2, low-pass filtered. It detects an inverted encoder or motor, which
-      accelerates the joint against its effort: x + y is the friction, and the opposed effort is almost |x|. If a hand
-      shakes a joint that a controller holds, y may also oppose x. Their sizes then differ, except for moments. The
-      opposed effort is negative if one of them is more than twice the other.
+      accelerates the joint against its effort: x + y is the friction, and the opposed effort is almost |x|. Both grow,
+      since the loop is unstable. If a hand presses a joint against a controller or a soft wall and lets go, y may also
+      oppose x, but x grows while y decreases. Opposed efforts are therefore zero unless both x and y grow.
     """
 
     text = "the motion does not follow from the effort"
@@ -49,7 +49,7 @@ class Response(Check):
     def begin(self, sample: Sample) -> None:
         """See `Check.begin`."""
         self._effort, self._velocity, self._lasting = sample.net_effort, sample.v, sample.net_effort
-        self._opposed = np.zeros_like(sample.q)
+        self._opposed = self._driving_size = self._inertial_size = np.zeros_like(sample.q)
         self._age = np.inf  # of M(q) / T [s]
 
     def check(self, sample: Sample) -> Mask:
@@ -65,9 +65,12 @@ class Response(Check):
         driving, inertial = self._effort - self._lasting, self._M.dot(sample.v - self._velocity)
         unexplained = driving - inertial
         self._lasting = self._lasting + min(sample.dt / self._memory, 1.0) * unexplained
-        size = np.abs(unexplained)
+        size, driving_size, inertial_size = np.abs(unexplained), np.abs(driving), np.abs(inertial)
         opposed = 0.5 * size - 1.5 * np.abs(driving + inertial)
+        opposed = opposed * (driving_size > self._driving_size) * (inertial_size > self._inertial_size)
         self._opposed = np.maximum(self._opposed + gain * (opposed - self._opposed), 0.0)
+        self._driving_size = self._driving_size + gain * (driving_size - self._driving_size)
+        self._inertial_size = self._inertial_size + gain * (inertial_size - self._inertial_size)
         # Negated comparison, so that NaN counts as implausible.
         return ~((size <= self._allowed) & (self._opposed <= self._opposed_tolerance))
 
