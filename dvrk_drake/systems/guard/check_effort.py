@@ -32,9 +32,10 @@ class Response(Check):
 
     - The unexplained effort |x - y| contains friction, external forces, model errors, and errors of sensors or motors.
     - The opposed effort is (|x - y| - 3 |x + y|) / 2, low-pass filtered. It detects an inverted encoder or motor, which
-      accelerates the joint against its effort: x + y is the friction, and the opposed effort is almost |x|. Both grow,
-      since the loop is unstable. If a hand presses a joint against a controller or a soft wall and lets go, y may also
-      oppose x, but x grows while y decreases. Opposed efforts are therefore zero unless both x and y grow.
+      accelerates the joint against its effort: x + y is the friction, and the opposed effort is almost |x|. It counts
+      only while both x and y grow, as in the unstable loop, and while y opposes the whole driving effort. If a hand
+      presses a joint against a controller or a soft wall and lets go, y opposes only the change of the effort, and
+      decreases while this change grows.
     """
 
     text = "the motion does not follow from the effort"
@@ -67,7 +68,8 @@ class Response(Check):
         self._lasting = self._lasting + min(sample.dt / self._memory, 1.0) * unexplained
         size, driving_size, inertial_size = np.abs(unexplained), np.abs(driving), np.abs(inertial)
         opposed = 0.5 * size - 1.5 * np.abs(driving + inertial)
-        opposed = opposed * (driving_size > self._driving_size) * (inertial_size > self._inertial_size)
+        grows = (driving_size > self._driving_size) & (inertial_size > self._inertial_size)
+        opposed = opposed * (grows & (self._effort * inertial < 0.0))
         self._opposed = np.maximum(self._opposed + gain * (opposed - self._opposed), 0.0)
         self._driving_size = self._driving_size + gain * (driving_size - self._driving_size)
         self._inertial_size = self._inertial_size + gain * (inertial_size - self._inertial_size)

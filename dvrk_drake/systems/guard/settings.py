@@ -59,7 +59,8 @@ class PlausibilitySettings:
             encoder count at this speed is added to `frozen_time`.
         response: Allowed unexplained effort as a fraction of the effort limit, in addition to `hand_effort`. See
             `check_effort.Response`.
-        opposed_effort: Allowed effort against which a joint accelerates, as a fraction of the effort limit.
+        opposed_effort: Allowed effort against which a joint accelerates, as a fraction of the effort limit. The public
+            recordings of real arms have at most 0.06.
         hand_effort: Allowed effort of the operator's hand or of a model error on a joint [N m]. For a prismatic joint,
             the allowed effort in N is ten times this value.
         response_time: Time constant of the filters of effort and acceleration [s].
@@ -90,7 +91,7 @@ class PlausibilitySettings:
     frozen_speed: float = field(default=0.1, metadata=within(0.001, 10.0, "rad/s"))
     response: float = field(default=1.3, metadata=within(0.2, 5.0))
     hand_effort: float = field(default=0.06, metadata=within(0.0, 5.0, "N m"))
-    opposed_effort: float = field(default=0.15, metadata=within(0.05, 5.0))
+    opposed_effort: float = field(default=0.1, metadata=within(0.05, 5.0))
     response_time: float = field(default=0.03, metadata=within(0.005, 0.5, "s"))
     response_memory: float = field(default=0.2, metadata=within(0.02, 10.0, "s"))
     start_gravity: float = field(default=0.1, metadata=within(0.02, 2.0))

@@ -294,7 +294,7 @@ PLAUSIBILITY_SETTINGS = {
     "frozen_speed": (0.001, 0.1, 10.0),
     "response": (0.2, 1.3, 5.0),
     "hand_effort": (0.0, 0.06, 5.0),
-    "opposed_effort": (0.05, 0.15, 5.0),
+    "opposed_effort": (0.05, 0.1, 5.0),
     "response_time": (0.005, 0.03, 0.5),
     "response_memory": (0.02, 0.2, 10.0),
     "start_gravity": (0.02, 0.1, 2.0),

@@ -235,7 +235,7 @@ class Light(Weightless):
 
 
 @pytest.mark.parametrize("joint", JOINTS)
-@pytest.mark.parametrize(("effort", "friction"), [(1.0, 0.0), (0.7, 0.1), (0.14, 0.0)])
+@pytest.mark.parametrize(("effort", "friction"), [(1.0, 0.0), (0.7, 0.1), (0.09, 0.0)])
 def test_acceleration_against_the_effort_is_found(joint, effort, friction):
     """Inverted encoder. Friction reduces the acceleration."""
     for sign, found in ((1, False), (-1, effort > SETTINGS.opposed_effort)):
@@ -259,6 +259,21 @@ def test_held_joint_may_be_shaken(damping):
         sensors.v = 180.0 / omega * min(phase / 6, 1.0) * np.sin(phase) * np.ones(N)
         sensors.q = sensors.q + MS * sensors.v
         sensors.effort = LIMIT * (0.4 * np.cos(phase) - damping * np.sin(phase)) * min(phase / 6, 1.0)
+        assert sensors.measure() == "", k
+
+
+@pytest.mark.parametrize("damping", [0.1, 0.5])
+def test_hand_may_let_go_of_a_pressed_joint(damping):
+    """A hand slowly deflects a joint against its controller, up to 0.9 of the effort limit, and lets go."""
+    sensors, stiffness, inertia = Sensors(model=Light()), 10.0 * LIMIT, LIMIT / 300.0
+    start, kd = sensors.q, 2.0 * damping * np.sqrt(stiffness * inertia)
+    for k in range(1500):
+        sensors.effort = -stiffness * (sensors.q - start) - kd * sensors.v
+        if k < 1000:
+            sensors.v = np.full(N, 0.09 * np.pi / 2 * np.sin(np.pi * MS * k))
+        else:
+            sensors.v = sensors.v + MS * sensors.effort / inertia
+        sensors.q = sensors.q + MS * sensors.v
         assert sensors.measure() == "", k
 
 
