@@ -94,23 +94,6 @@ def test_transforms_equal_forward_kinematics_of_drake(tmp_path, arm):
         assert {one.header.stamp.sec for one in moving.transforms} == {state.header.stamp.sec}
 
 
-def test_linkage_is_closed(tmp_path, arm):
-    """The points where the loops are cut coincide. Their frames are constant in the links of `loop_closures`."""
-    write_recording(poses_of(arm), tmp_path / "a.mcap", arm)
-    messages = decoded(tmp_path / "a.mcap")
-    frames = {frame.get("name"): frame for frame in compose_sdf(arm.sdf).iter("frame")}
-
-    def p_WP(X_WF, name):
-        offset = np.array(frames[name].findtext("pose").split()[:3], float)
-        return X_WF[f"{arm.name}/{frames[name].get('attached_to')}"] @ offset
-
-    assert arm.loop_closures
-    for moving in messages["/tf"]:
-        X_WF = poses_in_world(messages["/tf_static"][0], moving)
-        for loop in arm.loop_closures:
-            np.testing.assert_allclose(p_WP(X_WF, loop.frame_a), p_WP(X_WF, loop.frame_b), atol=1e-9)
-
-
 def test_urdf_has_the_frames_of_the_transforms(tmp_path, arm):
     recording = poses_of(arm)
     write_recording(recording, tmp_path / "a.mcap", arm)

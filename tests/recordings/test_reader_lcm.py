@@ -11,7 +11,6 @@ from mcap.reader import make_reader
 from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
 from recordings import csv_block
-from static_poses import motion_with_pauses
 from status_logs import ARM, START, N, log_bytes, statuses
 
 from dvrk_drake.cli import main
@@ -250,33 +249,6 @@ def test_commands_read_logs_like_csv_files(tmp_path, capsys):
         "no status of PSM (channel DVRK_STATUS_PSM). Channels in the log: DVRK_STATUS_MTML (40)"
         in capsys.readouterr().err
     )
-
-
-def test_log_of_a_moving_arm_is_identified_by_static_segments(tmp_path, capsys):
-    """Identifies a model from a log at 1 kHz. Friction during the motions between poses must not affect the model."""
-    generator = np.random.default_rng(5)
-    recording = motion_with_pauses(ARM, ARM.sample_poses(16, generator, margin=0.05), generator, 1.0, 1.0, 1000.0)
-    messages = []
-    for k, (q, qd, tau) in enumerate(zip(recording.q, recording.qd, recording.tau, strict=True)):
-        (status,) = statuses(1, utime=START + 1000 * k, sequence=k)
-        status.position, status.velocity, status.effort_measured = q.tolist(), qd.tolist(), tau.tolist()
-        messages.append(status)
-    log = write_log(tmp_path / "moving.log", messages)
-    assert main(["identify", str(log), "--arm", "mtml", "--output", str(tmp_path / "model.yaml")]) == 0
-    assert f"Static poses found in the motion: 16, in {len(messages)} rows." in capsys.readouterr().out
-    fresh = ARM.sample_poses(100, generator)
-    truth = IdentifiedModel.from_arm(ARM).holding_torque(fresh)
-    error = IdentifiedModel.load(tmp_path / "model.yaml").holding_torque(fresh) - truth
-    assert np.all(
-        np.sqrt(np.mean(error**2, axis=0)) < 0.02 * np.sqrt(np.mean(truth**2, axis=0)) + 1e-3 * ARM.effort_limits
-    )
-
-
-@pytest.mark.parametrize("options", [{"rate": 100.0}, {"topic": "/MTML"}, {"arrays": {"q": "q"}}])
-def test_options_of_other_formats_are_refused(tmp_path, options):
-    path = write_log(tmp_path / "a.log", statuses())
-    with pytest.raises(RecordingError, match=f"--{next(iter(options))} does not apply to an LCM log"):
-        read_recording(path, **options)
 
 
 # Files that are written during a recording.

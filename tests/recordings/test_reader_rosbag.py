@@ -9,8 +9,6 @@ from bags import KINDS, joint_states, write_bag
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode
 
-from dvrk_drake.analysis.check.recording_check import check_recording
-from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.locked_joints import lock_joints
@@ -371,11 +369,3 @@ def test_reads_a_bag_with_another_suffix(mtm, tmp_path, kind, name):
     with pytest.raises(RecordingError, match=re.escape(f"{path}: the bag cannot be read")) as caught:
         read_recording(path, mtm)
     assert "bag.bag" not in str(caught.value) and "bag.mcap" not in str(caught.value)  # names of the link
-
-
-def test_a_bag_with_one_message_is_checked(mtm, tmp_path):
-    q, qd, tau = blocks(1, 7)
-    path = write_bag(tmp_path, "mcap", {"/MTML/measured_js": joint_states(stamps(1), mtm.joint_names, q, qd, tau)})
-    report = check_recording(Observations(read_recording(path, mtm), mtm))
-    assert (report.kind, report.rows) == ("poses", 1)
-    assert any(finding.kind == "few poses" or finding.severity == "refusal" for finding in report.findings)

@@ -39,11 +39,6 @@ def test_other_files_and_folders_are_refused(tmp_path):
     assert_refused("not a valid file name", read_recording, "a\0.csv")
 
 
-@pytest.mark.parametrize("content", ["", " \n"])
-def test_an_empty_file_is_refused(tmp_path, content):
-    assert_refused(r"motion\.csv is empty", read_recording, write_text(tmp_path, content))
-
-
 def test_options_of_other_formats_are_refused(tmp_path):
     arrays, text = write_mat(tmp_path, a=team_array()), write_wpi(tmp_path, wpi_rows())
     assert_refused(f"--topic does not apply to {ARRAYS}", read_recording, arrays, topic="/MTML")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gzip
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -150,13 +149,6 @@ def test_recording_with_six_joints(tmp_path):
         read_recording(write_text(tmp_path, f"{HEADER}\n{ROW}"), arm=six_joint_arm())
 
 
-def test_non_files_are_refused(tmp_path):
-    with pytest.raises(RecordingError, match=r"absent\.csv: no such file"):
-        read_recording(tmp_path / "absent.csv")
-    with pytest.raises(RecordingError, match="is a folder without a recording"):
-        read_recording(tmp_path)
-
-
 def test_file_without_read_permission_is_refused():
     with public_folder() as folder:
         path = write_text(folder, HEADER)
@@ -167,11 +159,6 @@ def test_file_without_read_permission_is_refused():
                 read_recording(path)
 
         run_unprivileged(check)
-
-
-def test_unknown_coordinates_are_refused(tmp_path):
-    with pytest.raises(RecordingError, match='unknown coordinates "motor"; allowed: joint, actuator'):
-        read_recording(tmp_path / "any.csv", coordinates="motor")
 
 
 def test_rows_after_simple_blocks_keep_line_numbers(tmp_path, monkeypatch):
@@ -185,27 +172,6 @@ def test_rows_after_simple_blocks_keep_line_numbers(tmp_path, monkeypatch):
     bad = text + f"{ROW.replace('0.11', '1_1')},3\n"
     with pytest.raises(RecordingError, match=r"line 34: tau4 is not a number: '1_1'"):
         read_recording(write_text(tmp_path, bad))
-
-
-def test_time_to_read_a_recorded_file_is_close_to_that_of_numpy(tmp_path):
-    """The column guard_state must not select the parser of single rows, which takes six times as long as NumPy."""
-    table = np.random.default_rng(0).normal(size=(2000, 21)).tolist()
-    header = ",".join(f"{block}{i}" for block in ("q", "qd", "tau") for i in range(1, 8))
-    text = f"{header},guard_state\n" + "".join(f"{','.join(map(repr, row))},3\n" for row in table)
-    path = write_text(tmp_path, text)
-
-    def seconds(read):
-        """Processor time, because other processes may use the processor; the smallest of four."""
-        times = []
-        for _ in range(4):
-            begin = time.process_time()
-            read()
-            times.append(time.process_time() - begin)
-        return min(times)
-
-    ratio = seconds(lambda: read_recording(path)) / seconds(lambda: np.loadtxt(path, delimiter=",", skiprows=1))
-    # The goal is 0.4 s for 60,000 rows, for which np.loadtxt takes 0.2 s.
-    assert ratio < 2
 
 
 def test_an_empty_recording_is_refused_with_one_line():

@@ -20,13 +20,6 @@ def test_poses_inside_the_limits_fit():
     Recording(q=q).check_fits(arm)
 
 
-def test_positions_in_degrees_are_refused():
-    arm = load_arm("mtml")
-    q = np.degrees(arm.sample_poses(20, np.random.default_rng(0)))
-    with pytest.raises(RecordingError, match=r"of MTML\. Are the positions in degrees instead of rad"):
-        Recording(q=q).check_fits(arm)
-
-
 def test_psm_has_six_joints_and_the_jaw(tmp_path):
     path = write_text(tmp_path, f"{SIX}\n" + ",".join(["0"] * 12))
     with pytest.raises(RecordingError, match=r"missing column q7; .*joints of PSM: yaw, pitch, .*, wrist_yaw, jaw"):
@@ -141,11 +134,6 @@ def test_power_does_not_depend_on_the_coordinates():
     joint = actuator.in_joint_coordinates(load_arm("mtmr"))
     power = np.einsum("ij,ij->i", actuator.qd, actuator.tau)
     np.testing.assert_allclose(np.einsum("ij,ij->i", joint.qd, joint.tau), power, atol=1e-12)
-
-
-def test_joint_coordinates_are_unchanged():
-    recording = random_recording()
-    assert recording.in_joint_coordinates(load_arm("mtmr")) is recording
 
 
 @pytest.mark.parametrize(

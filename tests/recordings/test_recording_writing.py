@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import os
 import stat
-import threading
 
 import numpy as np
 import pytest
@@ -146,32 +145,3 @@ def test_suffix_of_a_bag_may_be_in_any_case(tmp_path):
     write_recording(recording, path, arm)
     assert path.read_bytes().startswith(b"\x89MCAP0\r\n")
     np.testing.assert_allclose(read_recording(path, arm).q, recording.q, atol=1e-12)
-
-
-def test_permissions_do_not_depend_on_the_umask_of_other_threads(tmp_path):
-    """The umask belongs to the process. A new file has the permissions of one of the umasks, never more."""
-    old, stop = os.umask(0o077), threading.Event()
-
-    def change():
-        while not stop.is_set():
-            os.umask(0o077)
-            os.umask(0o027)
-
-    def write(part):
-        for k in range(20):
-            with atomic_write(tmp_path / f"{part}_{k}") as stream:
-                stream.write("x")
-
-    writers = [threading.Thread(target=write, args=(part,)) for part in "ab"]
-    changer = threading.Thread(target=change)
-    try:
-        for thread in (changer, *writers):
-            thread.start()
-        for thread in writers:
-            thread.join()
-    finally:
-        stop.set()
-        changer.join()
-        os.umask(old)
-    modes = {stat.S_IMODE(path.stat().st_mode) for path in tmp_path.iterdir()}
-    assert len(list(tmp_path.iterdir())) == 40 and modes <= {0o600, 0o640}

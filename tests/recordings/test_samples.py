@@ -12,7 +12,6 @@ from forked import public_folder, run_unprivileged
 from repository import ROOT
 
 import dvrk_drake as dvrk
-from dvrk_drake.analysis.verdict import cross_validated_verdicts
 from dvrk_drake.cli import main
 from dvrk_drake.recordings.samples import SAMPLES, SAMPLES_FOLDER
 
@@ -67,14 +66,6 @@ def test_identified_model_is_better_than_the_nominal_model():
     assert (identified.verdict, nominal.verdict) == ("usable", "do not use")
     for name in ("shoulder_pitch", "elbow_pitch", "wrist_platform"):
         assert identified.relative_errors[name] < 0.5 * nominal.relative_errors[name]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["mtm_poses", "psm_motion"])
-def test_model_is_usable_in_cross_validation(name):
-    arm = dvrk.load_arm(SAMPLES[name])
-    result = dvrk.identify(dvrk.read_recording(SAMPLES_FOLDER / f"{name}.csv", arm), arm)
-    assert set(cross_validated_verdicts(result.model).values()) <= {"good", "usable", "off"}
 
 
 @pytest.mark.parametrize("name", ["mtm_motion", "psm_motion"])

@@ -14,9 +14,6 @@ from mcap.reader import make_reader
 from recordings import random_recording
 from rosbags.highlevel import AnyReader
 
-from dvrk_drake.analysis.identification import identify
-from dvrk_drake.analysis.pose_identification import StaticIdentification
-from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.reading import read_recording
@@ -93,21 +90,6 @@ def test_poses_without_times_remain_poses(tmp_path):
     assert not again.is_motion
     assert again.motion(ARMS["mtml"]) == ""
     np.testing.assert_array_equal(again.tau, poses.tau)
-
-
-@pytest.mark.parametrize("name", ARMS)
-def test_bag_of_poses_gives_the_model_of_the_csv(tmp_path, name):
-    """With more than `MIN_ROWS` poses, a bag with shorter intervals would be a motion."""
-    arm, generator = ARMS[name], np.random.default_rng(3)
-    q = arm.sample_poses(120, generator, margin=0.05)
-    tau = IdentifiedModel.from_arm(arm).holding_torque(q) * generator.normal(1.0, 0.02, q.shape)
-    torques = []
-    for file in ("poses.csv", "poses.mcap"):
-        write_recording(Recording(q=q, tau=tau), tmp_path / file, arm)
-        result = identify(read_recording(tmp_path / file, arm), arm)
-        assert isinstance(result, StaticIdentification)
-        torques.append(result.model.holding_torque(q))
-    np.testing.assert_allclose(*torques, atol=1e-12)
 
 
 def test_actuator_coordinates_are_converted(tmp_path):
