@@ -110,7 +110,7 @@ def start_controller(command: str) -> Background:
 
     On a busy computer, the guard may stop it. Then this function tries again.
     """
-    for _ in range(6):
+    for _ in range(20):
         controller = Background(command)
         try:
             controller.wait_for("effort;", show=False)
