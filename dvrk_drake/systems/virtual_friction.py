@@ -119,7 +119,7 @@ def attach(gravity, effort, slip, memory):  # pragma: no cover - compiled
     """Transfers the effort of a regulator to the springs, at the change from mode "hold" to "guide".
 
     The effort of the joint then has no step, and friction that the regulator held cannot push the joint away. The
-    spring of a joint that does not rest decays, see `virtual_friction`.
+    spring of a joint that moves faster than a joint at rest decays, see `virtual_friction`.
 
     Args:
         gravity, effort: Gravity effort and effort (n,) of the last period in mode "hold".
@@ -130,3 +130,4 @@ def attach(gravity, effort, slip, memory):  # pragma: no cover - compiled
     for i in range(n):
         memory[i] = min(max(gravity[i] - effort[i], -slip[i]), slip[i])
         memory[n + i] = 1.0
+        memory[5 * n + i] = REST_TIME  # a regulated joint is not led by a hand
