@@ -199,7 +199,7 @@ def test_springs_take_over_the_effort_of_the_regulator():
     guided = Guided(kd=0.0)
     guided.controller.SetMode(guided.context, "hold")
     guided.rest()
-    guided.move(Q + np.where(np.arange(N) % 2, 0.5, -1.5) * SLIP / KP, 0.01).rest(guided.measured)
+    guided.move(Q + np.where(np.arange(N) % 2, 0.5, -1.5) * SLIP / KP, 0.01).rest(guided.measured, 0.25)
     regulated = guided.added
     guided.controller.SetMode(guided.context, "guide")
     taken = np.clip(regulated, -SLIP, SLIP)
