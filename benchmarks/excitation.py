@@ -95,7 +95,7 @@ def simulated_arm(
     truth = true_dynamics(arm, rng, effects, SPREAD)
     others = [sampled(random_motion(arm, LIMITS, 10.0, 6, rng), 12.0) for _ in range(tests)]
     unseen = [recorded(truth, other, 0.0, rng) for other in others]
-    to_base = derive_base_parameters(truth.regressor, coupled_rotors=False).combination
+    to_base = derive_base_parameters(truth.regressor).combination
     true_values = to_base @ truth.parameters[: to_base.shape[1]]
     results = {}
     for which, motion in motions.items():

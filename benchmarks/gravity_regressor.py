@@ -17,8 +17,7 @@ from pinocchio_arm import build_pinocchio, regressor_loop
 from timing import measured_times, median_ratio, print_table, write_json
 
 from dvrk_drake.dynamics.compiled import entry_point
-from dvrk_drake.dynamics.holding_torque import holding_torque_into
-from dvrk_drake.dynamics.static_model import static_model
+from dvrk_drake.dynamics.holding_torque import holding_torque_into, static_model
 from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import make_arm_plant
@@ -44,9 +43,10 @@ def main() -> None:
     derive_gravity(arm)
     derivation = time.perf_counter() - start
     model = static_model(arm)
-    serial = derive_gravity(arm, serial=True)
+    is_serial = [parameter.label.isdigit() for parameter in model.gravity.standard_parameters]
+    serial = model.gravity.base.combination @ np.where(is_serial, model.gravity.standard_values, 0.0)
     reference = np.array([pinocchio.computeGeneralizedGravity(pin_model, pin_data, pose) for pose in q[:200]])
-    ours = model.torque(q[:200], serial.base_values)
+    ours = model.torque(q[:200], serial)
     rotor = plant.GetBodyByName("motor_4_link").default_mass() * np.linalg.norm(arm.gravity)
     # Pinocchio's chain lacks the rotor on the platform. The torques may differ only by the torque of the rotor's
     # weight.

@@ -16,7 +16,7 @@ import numpy as np
 from dvrk_drake.analysis.estimation.pose_effects import StaticProblem
 from dvrk_drake.analysis.pose_identification import identify_static
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
-from dvrk_drake.dynamics.static_model import static_model
+from dvrk_drake.dynamics.holding_torque import static_model
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import half_width
 from dvrk_drake.recordings.recording import Recording

@@ -20,7 +20,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from dvrk_drake.analysis.pose_identification import identify_static
-from dvrk_drake.analysis.pose_validation import validate_static
+from dvrk_drake.analysis.validation import validate_static
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm_files import load_arm

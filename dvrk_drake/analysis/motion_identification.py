@@ -9,7 +9,6 @@ from importlib.metadata import version
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.estimation.common_delay import common_delay
 from dvrk_drake.analysis.estimation.motion_columns import (
     DynamicColumns,
     RecordingEffect,
@@ -17,7 +16,7 @@ from dvrk_drake.analysis.estimation.motion_columns import (
     dynamic_columns,
     optional_effects,
 )
-from dvrk_drake.analysis.estimation.motion_effects import cross_validate, select_effects
+from dvrk_drake.analysis.estimation.motion_effects import common_delay, cross_validate, select_effects
 from dvrk_drake.analysis.estimation.motion_estimates import (
     ParameterCovariance,
     ResidualSeries,
@@ -104,12 +103,10 @@ class DynamicIdentification(Identification):
     Attributes:
         motions: Efforts of each recording.
         dry_friction: Coordinate -> sum of its Coulomb and presliding friction, and standard error of this sum [N m, N].
-        nominal_mass: Total mass of the links in the SDF [kg].
     """
 
     motions: tuple[FittedMotion, ...]
     dry_friction: dict[str, tuple[float, float]]
-    nominal_mass: float
 
 
 def identify_dynamic(
@@ -178,14 +175,12 @@ def identify_dynamic(
     section.base_parameters, section.correlations = motion_parameters(*fitted)
     model = _model(recordings, arm, section, covariance.estimates)
     progress(1.0)
-    nominal = float(sum(link.parameters[0] for link in problem.regressor.links))
     return DynamicIdentification(
         model=model,
         recording=recordings[0],
         num_rows=sum(map(len, recordings)),
         motions=motions,
         dry_friction=dry_friction(*fitted),
-        nominal_mass=nominal,
     )
 
 

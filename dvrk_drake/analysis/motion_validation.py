@@ -3,67 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.estimation.motion_columns import DIRECTION_WIDTH
+from dvrk_drake.analysis.error_shares import ErrorShares, error_shares
 from dvrk_drake.analysis.estimation.robust_fit import rms
 from dvrk_drake.analysis.observations.finding import Finding
 from dvrk_drake.analysis.observations.motion_grid import MotionGrid
-from dvrk_drake.analysis.observations.noise import MOTION_FREQUENCY
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.observations.repetition import motion_floor
 from dvrk_drake.analysis.results import JudgedError, Validation
 from dvrk_drake.analysis.verdict import coverage, judge, rule_text, tolerances
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.recordings.recording import GAP, MIN_GAP
 
-#: Number of frequencies of the sine and cosine functions in the position-dependent error: those of the cable effects in
-#: an arm file (`CABLES`).
-_HARMONICS = 2
 #: Smallest ratio of an error to the one expected on another day that is reported. It is exceeded in 12 of 12 pairs of
 #: recordings of two PSMs, and in 2 of 8 pairs of one PSM (benchmarks/three_joint_recordings.py).
 OTHER_ROBOT_RATIO = 1.75
-
-
-class ErrorShares(NamedTuple):
-    """Shares of the squared effort error of one actuator, by cause. The sum of all shares is 1.
-
-    Each share is what its cause explains in addition to the previous causes.
-
-    Attributes:
-        bias: Share due to the mean error.
-        friction_like: Additional share that viscous and Coulomb friction in the actuator explain.
-        position_dependent: Additional share that sine and cosine functions of the actuator's position explain. The
-            functions have half a period and one period over the range of the position.
-        acceleration_dependent: Additional share that is linear in the accelerations of all actuators (inertia).
-        posture_dependent: Additional share that is linear in the sines and cosines of the positions of all other
-            actuators (gravity, cables across joints). It may contain slow errors with other causes.
-        not_repeating: Share of the rest that differs between periods of the motion: half the mean square of its
-            difference between periods. No function of position, velocity and acceleration explains it. None if the
-            motion does not repeat.
-        fast: Share of the rest above `MOTION_FREQUENCY`, without the part that does not repeat: transients at reversals
-            of the velocity, vibration, errors of the delay.
-        other: Remaining share: slow and, in a periodic motion, the same in each period.
-    """
-
-    bias: float
-    friction_like: float
-    position_dependent: float
-    acceleration_dependent: float
-    posture_dependent: float
-    not_repeating: float | None
-    fast: float
-    other: float
-
-
-#: Labels of the fields of `ErrorShares` in tables and figures.
-SHARE_LABELS = (
-    *("bias", "friction-like", "position-dependent", "acceleration-dependent"),
-    *("posture-dependent", "not repeating", "fast", "other"),
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,14 +101,6 @@ class DynamicValidation(Validation):
             "mean_relative_error": self.mean_relative_error,
             "actuators": [{**asdict(actuator), "shares": actuator.shares._asdict()} for actuator in self.actuators],
         }
-
-    def error_shares(self, predicted: NDArray[np.float64]) -> list[ErrorShares]:
-        """Returns the shares of the error of each actuator for predicted efforts (r, n) [N m, N]."""
-        error = self.measured - predicted
-        return [
-            error_shares(error[:, i], i, self.q, self.v[:, i], self.vd, self.t, self.period)
-            for i in range(error.shape[1])
-        ]
 
 
 def predict_motion(model: IdentifiedModel, observations: Observations) -> NDArray[np.float64]:
@@ -252,73 +200,3 @@ def filtered_efforts(model: IdentifiedModel, grid: MotionGrid) -> NDArray[np.flo
 def _efforts(model: IdentifiedModel, grid: MotionGrid) -> NDArray[np.float64]:
     dynamics = model.dynamic_model
     return grid.efforts_at_rows(np.concatenate([dynamics.effort(g.q, g.v, g.vd) for g, _, _ in grid.each_segment()]))
-
-
-def error_shares(
-    error: NDArray[np.float64],
-    actuator: int,
-    q: NDArray[np.float64],
-    v: NDArray[np.float64],
-    vd: NDArray[np.float64],
-    t: NDArray[np.float64],
-    period: float | None,
-) -> ErrorShares:
-    """Returns the shares of the squared effort error of one actuator by cause.
-
-    Args:
-        error: Measured minus predicted efforts (r,) [N m, N].
-        actuator: Index of the actuator.
-        q: Positions (r, n) of all actuators [rad, m].
-        v: Velocities (r,) of the actuator [rad/s, m/s].
-        vd: Accelerations (r, n) of all actuators [rad/s^2, m/s^2].
-        t: Times (r,) at a nearly constant rate [s].
-        period: Period of the motion [s], or None if the motion does not repeat.
-    """
-    own, others = q[:, actuator], np.delete(q, actuator, axis=1)
-    width = DIRECTION_WIDTH * float(np.sqrt(np.mean(v**2))) or 1.0
-    travel = (own - own.min()) / (float(np.ptp(own)) or 1.0)
-    kinds = [
-        [np.ones_like(own)],
-        [v, np.tanh(v / width)],
-        [f(np.pi * k * travel) for k in range(1, _HARMONICS + 1) for f in (np.sin, np.cos)],
-        list(vd.T),
-        [*np.sin(others).T, *np.cos(others).T],
-    ]
-    shares = []
-    columns: list[NDArray[np.float64]] = []
-    unexplained = float(np.mean(error**2))
-    total = unexplained or 1.0
-    rest = error
-    for kind in kinds:
-        columns += kind
-        X = np.column_stack(columns)
-        rest = error - X @ np.linalg.lstsq(X, error, rcond=None)[0]
-        remaining = float(np.mean(rest**2))
-        shares.append((unexplained - remaining) / total)
-        unexplained = remaining
-    bias, friction, position, acceleration, posture = shares
-    slow = _slow_part(rest, t)
-    repeating, sizes = [], []
-    for part in (rest - slow, slow):
-        size = float(np.mean(part**2))
-        sizes.append(size)
-        repeating.append(max(0.0, size - _mean_square_between_periods(part, t, period)))
-    fast, other = repeating
-    not_repeating = None if period is None else (sum(sizes) - fast - other) / total
-    return ErrorShares(bias, friction, position, acceleration, posture, not_repeating, fast / total, other / total)
-
-
-def _slow_part(x: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns the part of a signal (r,) below `MOTION_FREQUENCY`. It is orthogonal to the rest of the signal."""
-    frequency = np.fft.rfftfreq(len(x), float(t[-1] - t[0]) / (len(t) - 1))
-    return np.fft.irfft(np.where(frequency < MOTION_FREQUENCY, np.fft.rfft(x), 0.0), len(x))
-
-
-def _mean_square_between_periods(x: NDArray[np.float64], t: NDArray[np.float64], period: float | None) -> float:
-    """Returns half the mean square of the difference of a signal (r,) between periods. Returns 0 without a period."""
-    if period is None:
-        return 0.0
-    # Times in a gap have no measurement.
-    after = np.clip(np.searchsorted(t, t + period), 1, len(t) - 1)
-    first = (t + period <= t[-1]) & (t[after] - t[after - 1] < max(MIN_GAP, GAP * float(np.median(np.diff(t)))))
-    return float(np.mean((np.interp(t[first] + period, t, x) - x[first]) ** 2)) / 2

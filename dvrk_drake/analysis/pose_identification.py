@@ -12,23 +12,23 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.estimation.pose_effects import MIN_TORQUE, StaticProblem, select_effects
 from dvrk_drake.analysis.estimation.robust_fit import FOLDS, blocks, rms, weighted_fit
-from dvrk_drake.analysis.observations.excluded_measurements import (
+from dvrk_drake.analysis.observations.static_poses import (
     ExcludedMeasurement,
     exclude_outliers,
     find_excluded,
     usable_measurements,
+    usable_poses,
 )
-from dvrk_drake.analysis.observations.static_poses import usable_poses
 from dvrk_drake.analysis.results import Identification
 from dvrk_drake.analysis.verdict import LARGEST_RATIO
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
+from dvrk_drake.dynamics.holding_torque import static_model
 from dvrk_drake.dynamics.identified_model import (
     BaseParameterEstimate,
     IdentifiedModel,
     JointStatistics,
     Provenance,
 )
-from dvrk_drake.dynamics.static_model import static_model
 from dvrk_drake.errors import IdentificationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import DriveEffect

@@ -12,7 +12,7 @@ from dvrk_drake.analysis.estimation.estimator import Estimator, Prior
 from dvrk_drake.analysis.estimation.motion_estimates import MAX_CORRELATION_TIME
 from dvrk_drake.analysis.estimation.normal_equations import NormalEquations, fold_sums
 from dvrk_drake.analysis.estimation.priors import EFFECT_DEVIATION
-from dvrk_drake.analysis.observations.drive_efforts import (
+from dvrk_drake.analysis.observations.motion_difference import (
     FrictionPart,
     drive_efforts,
     refuse_opposite_efforts,

@@ -113,30 +113,6 @@ def judge(effort: float, error: float, tolerance: Tolerance, covered: float, *, 
     return "usable" if is_small and error <= max(tolerance) else "do not use"
 
 
-def reason(
-    verdict: Verdict, effort: float, error: float, tolerance: Tolerance, covered: float, *, prismatic: bool = False
-) -> str:
-    """Returns the numbers behind a verdict of `judge` in a few sentences.
-
-    Args:
-        verdict: Verdict on the joint.
-        effort, error, tolerance, covered: See `judge`.
-        prismatic: True for a prismatic joint, whose error is in N.
-    """
-    if verdict == "off":
-        if effort == 0:
-            return "The model commands no torque, because no effort was measured."
-        return "The model commands no torque, because the joint has none or it is not separated from friction."
-    if verdict == "not judged":
-        return "No effort was measured, the joint did not move, or no error is known."
-    unit, travel = ("N", "1.5 mm") if prismatic else ("N m", "15 mrad")
-    return (
-        f"The RMS error is {error:.2g} {unit} or {100 * error / effort:.0f} % of the measured effort. Dry friction: "
-        f"{tolerance.friction:.2g} {unit}. Torque of the gains at {travel}: {tolerance.stiffness:.2g} {unit}. Range "
-        f"covered{'' if prismatic else ' (at most 180 deg count)'}: {100 * covered:.0f} %."
-    )
-
-
 def rule_text() -> str:
     """Returns the rule of `judge` as text, with the thresholds."""
     return (

@@ -67,7 +67,7 @@ def control(
         hysteresis_ratio: Share of the wide hysteresis to compensate in the modes gravity and guide, 0 to 0.9.
         friction_model: Model with the friction parameters, identified from a motion. Default: the model of --model.
     """
-    from dvrk_drake.dynamics.slip_effort import is_cross_validated
+    from dvrk_drake.dynamics.friction_compensation import is_cross_validated
     from dvrk_drake.processes.arm_session import Dialog
     from dvrk_drake.processes.live_status import LiveLine, LiveStatus
 

@@ -128,9 +128,6 @@ def export_model(
         if format != "urdf" or "sdf" not in outputs:  # both formats contain the same model
             show_page(export_page(path, exports[format]), verbose=verbose)
     for format, path in outputs.items():
-        if omitted := exports[format].omitted_shapes:
-            shapes = ", ".join(f"{shape} of {link}" for link, shape in omitted)
-            print(f"Omitted in {path}, because they touch shapes of other links: {shapes}")
         print_written(path)
         if format in MODEL_FORMATS and Path(path).with_name(mesh_folder(Path(path))).is_dir():
             print_written(Path(path).with_name(mesh_folder(Path(path))), "meshes")

@@ -135,7 +135,7 @@ def _page(
         compare: Path of a previous model, or None.
         saved: Whether the verdicts are stored in the model file.
     """
-    from dvrk_drake.analysis.baselines import baseline_efforts
+    from dvrk_drake.analysis.validation import baseline_efforts
     from dvrk_drake.reports.identification import identification_page
 
     baselines = baseline_efforts(result, None if compare is None else load_model(compare, None))

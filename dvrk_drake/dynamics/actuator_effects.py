@@ -8,12 +8,12 @@ coefficient * shape(x, v, state) to the effort along its coordinate, see `effect
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from dvrk_drake.dynamics.compiled import compiled
 from dvrk_drake.models.arm import Arm
@@ -242,6 +242,28 @@ def effect_column(arm: Arm, effect: ActuatorEffect, q: NDArray[np.float64]) -> N
     """Returns the joint torques (m, n) of a position-dependent effect at poses q (m, n), for a coefficient of 1."""
     x = position_along(arm, effect.coordinate, q)
     return effect.column(x, 0 * x)[:, None] * joint_row(arm, effect.coordinate)
+
+
+def sliding_effort(
+    effects: Iterable[DriveEffect], x: ArrayLike, v: NDArray[np.float64], load: ArrayLike = 0.0
+) -> NDArray[np.float64]:
+    """Returns the effort (k,) of effects along their common coordinate at constant speeds v (k,) [N m, N].
+
+    Presliding effects have their final value, because the coordinate slides. At v = 0, friction is 0.
+
+    Args:
+        effects: Effects of one coordinate.
+        x: Positions (k,) of the coordinate [rad, m], or a number.
+        v: Speeds of the coordinate [rad/s, m/s].
+        load: Magnitudes (k,) of the effort along the coordinate, or a number, for load-dependent friction [N m, N].
+    """
+    effort = np.zeros(len(v))
+    travels = np.where(v == 0, 0.0, np.copysign(np.inf, v))
+    rows = list(zip(*np.broadcast_arrays(travels, x, v, load), strict=True))
+    for effect in effects:
+        law = ActuatorEffect.of(effect)
+        effort += effect.coefficient * np.array([law.step(0.0, *row)[1] for row in rows])
+    return effort
 
 
 def spring_over(coordinate: str, x: NDArray[np.float64]) -> ActuatorEffect:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import scipy.linalg
 from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform
 
@@ -189,30 +190,20 @@ class DynamicBaseParameters:
         return np.asarray(np.linalg.solve(self.to_links.T, self.base.combination.T).T, dtype=np.float64)
 
 
-def derive_base_parameters(model: DynamicRegressor, coupled_rotors: bool = True) -> DynamicBaseParameters:
+def derive_base_parameters(model: DynamicRegressor) -> DynamicBaseParameters:
     """Derives the base parameters numerically from the regressor at random states.
 
     The states are chosen so that gravity, velocity and acceleration terms have similar magnitude. The base parameters
     depend on the orientation of the base. If the base is tilted, additional parameters of the first links can affect
-    the torque.
-
-    Args:
-        model: Regressor of the arm.
-        coupled_rotors: False to exclude the terms that couple two rotors. Real motors have no such terms (see
-            `rotor_inertias`). The last columns of the regressor belong to these terms, so p is reduced by their number.
+    the torque. The last columns of the regressor, for terms that couple two rotors, are excluded, because real motors
+    have no such terms (see `rotor_inertias`).
     """
     frames = _link_frames(model)
-    rotors = [rotor for rotor in model.rotors if coupled_rotors or rotor.actuators[0] == rotor.actuators[1]]
-    p = len(model.values) - len(model.rotors) + len(rotors)
-    to_links = np.eye(p)
-    parameters = []
-    for i, (label, X_LF) in enumerate(frames):
-        to_links[10 * i : 10 * i + 10, 10 * i : 10 * i + 10] = change_of_frame(X_LF)
-        parameters += [StandardParameter(label, axis) for axis in _AXES]
-    for rotor in rotors:
-        a, b = (model.arm.joint_names.index(name) for name in rotor.actuators)
-        label = f"{a + 1}" if a == b else f"{a + 1},{b + 1}"
-        parameters.append(StandardParameter(label, "a", prismatic=bool(a == b and model.arm.prismatic[a])))
+    to_links = scipy.linalg.block_diag(*(change_of_frame(X_LF) for _, X_LF in frames), np.eye(model.arm.num_joints))
+    p = len(to_links)
+    parameters = [StandardParameter(label, axis) for label, _ in frames for axis in _AXES]
+    for i, prismatic in enumerate(model.arm.prismatic, start=1):
+        parameters.append(StandardParameter(f"{i}", "a", prismatic=bool(prismatic)))
     base = reduce_to_base(
         _regressor_at_random_states(model)[:, :p] @ to_links,
         parameters,

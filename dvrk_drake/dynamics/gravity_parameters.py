@@ -19,7 +19,7 @@ from dvrk_drake.dynamics.kinematic_tree import KinematicTree
 from dvrk_drake.dynamics.regressor_kernel import fill_regressor
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.plant import arm_frames, base_body, shared_plant
+from dvrk_drake.models.plant import DH_PREFIX, arm_frames, base_body, shared_plant
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ class GravityParameters:
         lengths: Name -> distance between link frames [m]. The names of the base parameters contain these names.
         base: Base parameters beta = base.combination @ standard_values, in the units `base.units`.
         tree: Links and their frames F, without the balanced rotors.
-        link_rows: Index in `tree` of the link of each standard mass. `serial` omits the other links.
+        link_rows: Index in `tree` of the link of each standard mass.
     """
 
     arm: Arm
@@ -80,43 +80,32 @@ class GravityParameters:
 
 
 @cache
-def gravity_parameters(arm: Arm, frames: str = "dh", serial: bool = False) -> GravityParameters:
-    """Returns the base parameters of an arm's gravity torque.
+def gravity_parameters(arm: Arm) -> GravityParameters:
+    """Returns the base parameters of an arm's gravity torque, expressed in the frames of `link_frames`.
 
     Args:
         arm: Arm whose gravity vector specifies the orientation of the base.
-        frames: Prefix of the SDF frames in which the parameters are expressed: "dh" for the DH frames of the dVRK, or
-            another prefix of the arm's SDF, e.g. "paper" for the frames of Rutfield et al. (2015). See `link_frames`.
-        serial: True to omit the links of the linkage (crank, coupler), as in Rutfield et al. (2015).
 
     Raises:
-        ArmError: The SDF has no frames with this prefix, gravity is less than 1 m/s^2, or `serial` is True and a joint
-            moves a link without a numbered frame, such as a jaw.
+        ArmError: Gravity is less than 1 m/s^2.
     """
     if (size := float(np.linalg.norm(arm.gravity))) < 1.0:
         raise ArmError(f"{arm.name}: gravity is {size:.3g} m/s^2; it must be 1 m/s^2 or more for a gravity model")
-    plant = shared_plant(arm)
-    labels = link_frames(arm, frames)
+    labels = link_frames(arm)
     of_body = {body.name(): X_BF for body, X_BF in labels.values()}
-    tree = KinematicTree.from_plant(plant, arm).without(rotor_links(arm))
+    tree = KinematicTree.from_plant(shared_plant(arm), arm).without(rotor_links(arm))
     tree = tree.in_frames([of_body[link] for link in tree.links])
-    kept = {label: body for label, (body, _) in labels.items() if label.isdigit() or not serial}
-    driven = {plant.GetJointByName(name).child_body().index() for name in arm.joint_names}
-    if serial and not driven <= {body.index() for body in kept.values()}:
-        raise ArmError(
-            f"{arm.name}: serial is not possible, because a joint moves a link that has no frame {frames}_<number>"
-        )
-    link_rows = np.array([tree.links.index(body.name()) for body in kept.values()])
-    parameters = [StandardParameter(label, axis) for label in kept for axis in ("", "x", "y", "z")]
-    lengths = named_lengths(arm, labels, frames)
-    poses = np.random.default_rng(0).uniform(-2, 2, (4 * len(kept) + 10, arm.num_joints))
+    link_rows = np.array([tree.links.index(body.name()) for body, _ in labels.values()])
+    parameters = [StandardParameter(label, axis) for label in labels for axis in ("", "x", "y", "z")]
+    lengths = named_lengths(arm, labels)
+    poses = np.random.default_rng(0).uniform(-2, 2, (4 * len(labels) + 10, arm.num_joints))
     columns = (10 * link_rows[:, None] + np.arange(4)).ravel()
     regressor = _regressor_at_rest(tree, arm.gravity / size, columns, poses).reshape(-1, len(columns))
-    immobile = {label for label, row in zip(kept, link_rows, strict=True) if not np.any(tree.G[row])}
+    immobile = {label for label, row in zip(labels, link_rows, strict=True) if not np.any(tree.G[row])}
     return GravityParameters(
         arm=arm,
         standard_parameters=tuple(parameters),
-        to_standard=_to_standard(arm, [labels[label] for label in kept]),
+        to_standard=_to_standard(arm, list(labels.values())),
         lengths={name: length for name, length in lengths.items() if name != "1"},
         base=reduce_to_base(regressor, parameters, preference_order(parameters, immobile=immobile), lengths),
         tree=tree,
@@ -167,25 +156,19 @@ def _balanced_rotor(plant: MultibodyPlant, joint: Joint) -> NDArray[np.float64]:
     return np.block([[np.ones((1, 1)), np.zeros((1, 3))], [(p_BM - R_BC @ along @ p_CM)[:, None], R_BC @ along]])
 
 
-def link_frames(arm: Arm, frames: str = "dh") -> dict[str, tuple[RigidBody, RigidTransform]]:
+def link_frames(arm: Arm) -> dict[str, tuple[RigidBody, RigidTransform]]:
     """Returns label -> (moving body B, pose X_BF of its frame F) for all links except balanced rotors.
 
-    The parameters of the body are expressed in frame F. This is the frame <frames>_<number>, or dh_<name> for a link of
-    a linkage. The label is <number> or <name>. If a body has several such frames, the first one in this order is F. For
-    a body without such a frame, F is the frame of the link, and the label is its name without the suffix "_link".
+    The parameters of the body are expressed in frame F. This is the frame dh_<number>, or dh_<name> for a link of a
+    linkage. The label is <number> or <name>. If a body has several such frames, the first one in this order is F. For a
+    body without such a frame, F is the frame of the link, and the label is its name without the suffix "_link".
     Numbered links come first.
-
-    Raises:
-        ArmError: `frames` is not "dh", and the SDF has no numbered frames with this prefix.
     """
     plant = shared_plant(arm)
     found = {}
     for frame in arm_frames(plant):
-        prefix, _, label = frame.name().partition("_")
-        if (prefix == frames or (prefix == "dh" and not label.isdigit())) and not plant.IsAnchored(frame.body()):
-            found[label] = (frame.body(), frame.GetFixedPoseInBodyFrame())
-    if frames != "dh" and not any(label.isdigit() for label in found):
-        raise ArmError(f'the SDF has no frames "{frames}_1", "{frames}_2", ...; use the prefix "dh"')
+        if frame.name().startswith(DH_PREFIX) and not plant.IsAnchored(frame.body()):
+            found[frame.name().removeprefix(DH_PREFIX)] = (frame.body(), frame.GetFixedPoseInBodyFrame())
     bodies: dict[str, tuple[RigidBody, RigidTransform]] = {}
     for label in sorted(found, key=lambda label: (not label.isdigit(), int(label) if label.isdigit() else 0, label)):
         if all(found[label][0] != body for body, _ in bodies.values()):
@@ -202,9 +185,7 @@ def exact_rotation(R: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(np.abs(R - np.round(R)) < 1e-12, np.round(R), R)
 
 
-def named_lengths(
-    arm: Arm, labels: Mapping[str, tuple[RigidBody, RigidTransform]], frames: str = "dh"
-) -> dict[str, float]:
+def named_lengths(arm: Arm, labels: Mapping[str, tuple[RigidBody, RigidTransform]]) -> dict[str, float]:
     """Returns name -> distance between the frames of neighbouring links [m], such as "L2" and "L_crank".
 
     The entry "1" is 1.0, the factor of terms that contain no length.
@@ -214,8 +195,8 @@ def named_lengths(
     lengths = {"1": 1.0}
     for label in labels:
         if label.isdigit():
-            previous = plant.GetFrameByName(f"{frames}_{int(label) - 1}")
-            X = plant.GetFrameByName(f"{frames}_{label}").CalcPose(context, previous)
+            previous = plant.GetFrameByName(f"{DH_PREFIX}{int(label) - 1}")
+            X = plant.GetFrameByName(f"{DH_PREFIX}{label}").CalcPose(context, previous)
             name = f"L{label}"
         else:
             parents = [plant.get_joint(j) for j in plant.GetJointIndices(base_body(plant).model_instance())]

@@ -26,8 +26,7 @@ from dvrk_drake.dynamics.dynamic_section import (
     SignalSettings,
 )
 from dvrk_drake.dynamics.gravity_parameters import gravity_parameters
-from dvrk_drake.dynamics.holding_torque import holding_torque_into
-from dvrk_drake.dynamics.static_model import StaticModel, static_model
+from dvrk_drake.dynamics.holding_torque import StaticModel, holding_torque_into, static_model
 from dvrk_drake.errors import ArmError, ModelError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import known_arms, load_arm

@@ -11,13 +11,13 @@ from pydrake.solvers import ClarabelSolver, MathematicalProgram
 
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+from dvrk_drake.dynamics.holding_torque import static_model
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import (
     LinkInertia,
     parameters_from_pseudo_inertia,
     rotor_links,
 )
-from dvrk_drake.dynamics.static_model import static_model
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import shared_plant

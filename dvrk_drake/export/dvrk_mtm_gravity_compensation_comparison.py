@@ -9,14 +9,15 @@ from numpy.typing import NDArray
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ModelError
-from dvrk_drake.export.dvrk_mtm_controller import (
+from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import (
     MTM_JOINTS,
     NUM_GRAVITY,
+    NUM_JOINTS,
+    GravityCompensationFile,
     controller_regressor,
     controller_torque,
     unclipped_torque,
 )
-from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import NUM_JOINTS, GravityCompensationFile
 from dvrk_drake.models.arm_files import known_arms
 from dvrk_drake.models.files import Reportable
 

@@ -7,13 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
+import numpy as np
+from numpy.typing import NDArray
+
+from dvrk_drake.dynamics.actuator_effects import joint_row, position_along, sliding_effort
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.model_links import ModelBodies, model_bodies
 from dvrk_drake.errors import ModelError
-from dvrk_drake.export.drive_approximation import DriveApproximation, approximate_drives
-from dvrk_drake.export.dvrk_mtm_controller import MTM_JOINTS
 from dvrk_drake.export.dvrk_mtm_gravity_compensation import CompensationOptions, compensation_from_model, dry_friction
-from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
+from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import MTM_JOINTS, GravityCompensationFile
 from dvrk_drake.export.dvrk_psm_gravity_compensation import (
     KinematicCompensation,
     configuration_beside,
@@ -21,7 +23,6 @@ from dvrk_drake.export.dvrk_psm_gravity_compensation import (
     kinematic_compensation,
 )
 from dvrk_drake.export.model_writer import MeshFormat, refuse_existing_meshes, write_model
-from dvrk_drake.export.touching_shapes import touching_shapes
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import refuse_existing
 from dvrk_drake.models.mjcf import Drive
@@ -65,11 +66,6 @@ class ModelExport:
         represented = {"gravity", "rotors"} if self.format == "mjcf" else set()
         represented |= {"drives"} if self.drives is not None else set()
         return [text for kind, text in self.bodies.left_out.items() if kind not in represented]
-
-    @property
-    def omitted_shapes(self) -> tuple[tuple[str, str], ...]:
-        """Links and names of the collision shapes that the file omits, see `touching_shapes`."""
-        return touching_shapes(self.model.arm) if self.format == "urdf" else ()
 
     def write(self, path: str | Path) -> None:
         """Writes the file atomically and replaces an existing file.
@@ -229,3 +225,75 @@ def export_model(
     )
     export.write(path)
     return export
+
+
+#: Number of random poses and velocities at which the effects are approximated.
+_SAMPLES = 400
+#: Largest speeds of the samples [rad/s, m/s], about those of an excitation of a dVRK.
+_SPEEDS = (1.0, 0.1)
+
+
+@dataclass(frozen=True, eq=False)
+class DriveApproximation:
+    """Friction and springs of the drives in a form that simulators have, and what this form omits.
+
+    Attributes:
+        drives: Dry friction, viscous friction and linear spring along each coordinate.
+        effort: RMS effort (n,) of all effects on each joint while the arm moves [N m, N].
+        difference: RMS difference (n,) between this effort and that of `drives` on each joint [N m, N].
+    """
+
+    drives: tuple[Drive, ...]
+    effort: NDArray[np.float64]
+    difference: NDArray[np.float64]
+
+
+def approximate_drives(model: IdentifiedModel, *, coupled: bool = True) -> DriveApproximation:
+    """Returns the least-squares approximation of the effects of a model, or of its arm if the model has no dynamics.
+
+    Each coordinate has the effort F sign(v) + D v + K x with F, D and K of 0 or more. Presliding friction is
+    approximated by its friction after the travel. Loads are the efforts that compensate gravity.
+
+    Args:
+        model: Model of an arm.
+        coupled: Whether the format has friction along combinations of joints. Otherwise, the dry friction of a
+            coordinate acts on each of its joints, viscous friction only on the diagonal, and springs are omitted.
+    """
+    from scipy.optimize import nnls
+
+    arm, known = model.arm, model.arm.effects
+    effects = list(model.dynamics.effects) if model.dynamics else [*known.friction, *known.cables, *known.springs]
+    generator = np.random.default_rng(0)
+    q = arm.sample_poses(_SAMPLES, generator)
+    v = arm.per_joint(*_SPEEDS) * generator.uniform(-1.0, 1.0, q.shape)
+    weight = arm.transmission.inverse.pull_back_effort(model.holding_torque(q))
+    total, drives = np.zeros_like(q), []
+    for name in dict.fromkeys(effect.coordinate for effect in effects):
+        row = joint_row(arm, name)
+        own = [effect for effect in effects if effect.coordinate == name]
+        load = np.abs(weight @ arm.effect_coordinates[name]) / np.sum(arm.effect_coordinates[name] ** 2)
+        effort = sliding_effort(own, position_along(arm, name, q), v @ row, load)
+        (dry, viscous, stiffness), _ = nnls(np.column_stack([np.sign(v @ row), v @ row, q @ row]), effort)
+        moved = {joint: float(r) for joint, r in zip(arm.joint_names, row, strict=True) if abs(r) > 1e-12}
+        drives.append(Drive(name, moved, float(dry), float(viscous), float(stiffness)))
+        total += effort[:, None] * row
+    if not coupled:
+        drives = _of_single_joints(arm, drives)
+    difference = total - sum((_on_joints(arm, drive, q, v) for drive in drives), np.zeros_like(q))
+    rms = [np.sqrt(np.mean(x**2, axis=0)) for x in (total, difference)]
+    return DriveApproximation(tuple(drives), *rms)
+
+
+def _of_single_joints(arm: Arm, drives: Sequence[Drive]) -> list[Drive]:
+    singles = []
+    for joint in arm.joint_names:
+        own = [(drive, drive.row[joint]) for drive in drives if joint in drive.row]
+        dry, viscous = sum(abs(r) * d.dry for d, r in own), sum(r**2 * d.viscous for d, r in own)
+        singles.append(Drive(joint, {joint: 1.0}, dry, viscous))
+    return singles
+
+
+def _on_joints(arm: Arm, drive: Drive, q: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
+    row = np.array([drive.row.get(joint, 0.0) for joint in arm.joint_names])
+    effort = drive.dry * np.sign(v @ row) + drive.viscous * (v @ row) + drive.stiffness * (q @ row)
+    return effort[:, None] * row

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia, link_inertias
 from dvrk_drake.errors import ArmError, DvrkDrakeError, ModelError
 from dvrk_drake.export.gltf import to_obj
-from dvrk_drake.export.touching_shapes import touching_shapes
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import MAX_BINARY, atomic_write, open_input, read_json_input
 from dvrk_drake.models.mjcf import Drive, to_mjcf
@@ -109,8 +108,7 @@ def write_model(
         path: Path of the file.
         origin: Source of the inertias, written into a comment at the start of the file.
         meshes: "obj" converts glTF meshes to OBJ, for programs that do not read glTF, such as PyBullet and MuJoCo.
-        format: Format of the file. A URDF does not contain `touching_shapes`, see `to_urdf`. The meshes of an MJCF are
-            OBJ files, and its keyframes are random poses of the arm.
+        format: Format of the file. The meshes of an MJCF are OBJ files, and its keyframes are random poses of the arm.
         drives: Friction, springs and rotors. SDF and URDF contain only the friction of single joints.
 
     Raises:
@@ -125,10 +123,6 @@ def write_model(
     else:
         _add_friction(root, drives)
     if format == "urdf":
-        for link in root.iterfind("model/link"):
-            for shape in link.findall("collision"):
-                if (link.get("name"), shape.get("name")) in touching_shapes(arm):
-                    link.remove(shape)
         root = to_urdf(root)
     copy_meshes(copies)
     with atomic_write(target) as stream:

@@ -25,7 +25,7 @@ from typing import Literal
 
 import yaml
 
-from dvrk_drake.analysis.excitation.collisions import CollisionDetector
+from dvrk_drake.analysis.excitation.motion_limits import CollisionDetector
 from dvrk_drake.analysis.excitation.periodic_motion import PeriodicMotion
 from dvrk_drake.analysis.excitation.pose_file import CollectionFile, load_poses
 from dvrk_drake.dynamics.identified_model import IdentifiedModel

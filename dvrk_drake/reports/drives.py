@@ -7,8 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, is_prismatic, joint_row, position_along
-from dvrk_drake.dynamics.drive_curves import friction_curve, position_curve
+from dvrk_drake.dynamics.actuator_effects import (
+    ActuatorEffect,
+    is_prismatic,
+    joint_row,
+    position_along,
+    sliding_effort,
+)
 from dvrk_drake.dynamics.dynamic_model import effect_shapes
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effect_kinds import POSITION_KINDS
@@ -69,7 +74,7 @@ def _friction(efforts: Efforts) -> Plot | None:
         x = float(np.sqrt(np.mean(position_along(arm, name, grid.q) ** 2)))
         load = float(np.mean(np.abs(transmitted @ h)) / (h @ h))
         effort, length = ("N", "m") if is_prismatic(arm, name) else ("N m", "rad")
-        marks = _marks(speed, dots, v, friction_curve(effects, name, v, load, x))
+        marks = _marks(speed, dots, v, sliding_effort([e for e in effects if e.coordinate == name], x, v, load))
         panels.append(Panel(name, marks, f"speed [{length}/s]", f"friction [{effort}]", height=200))
     caption = "Friction along each coordinate over its speed. Near zero speed, presliding makes the dots differ"
     return Plot("friction", caption, panels, columns=2)
@@ -78,19 +83,20 @@ def _friction(efforts: Efforts) -> Plot | None:
 def _torque(
     arm: Arm, effects: Sequence[DriveEffect], q: NDArray[np.float64], residuals: NDArray[np.float64]
 ) -> Plot | None:
-    own = [e for e in effects if e.kind in POSITION_KINDS]
+    all_own = [e for e in effects if e.kind in POSITION_KINDS]
     panels = []
-    for name in dict.fromkeys(e.coordinate for e in own if e.kind != "offset"):
+    for name in dict.fromkeys(e.coordinate for e in all_own if e.kind != "offset"):
+        own = [e for e in all_own if e.coordinate == name]
         x = position_along(arm, name, q)
         curve = np.linspace(x.min(), x.max(), _POINTS)
         row = joint_row(arm, name)
         used = row != 0
-        dots = position_curve(own, name, x) + residuals[:, used] @ row[used] / (row @ row)
+        dots = sliding_effort(own, x, np.zeros_like(x)) + residuals[:, used] @ row[used] / (row @ row)
         effort, length = ("N", "m") if is_prismatic(arm, name) else ("N m", "rad")
         panels.append(
             Panel(
                 name,
-                _marks(x, dots, curve, position_curve(own, name, curve)),
+                _marks(x, dots, curve, sliding_effort(own, curve, np.zeros_like(curve))),
                 f"position [{length}]",
                 f"{'force' if effort == 'N' else 'torque'} [{effort}]",
                 x_range=axis_range(x),

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dvrk_drake.analysis.error_shares import SHARE_LABELS, error_shares, pose_error_shares, residual_structure
 from dvrk_drake.analysis.motion_identification import DynamicIdentification
-from dvrk_drake.analysis.motion_validation import SHARE_LABELS, DynamicValidation, error_shares
-from dvrk_drake.analysis.observations.excluded_measurements import ExcludedMeasurement
+from dvrk_drake.analysis.motion_validation import DynamicValidation
 from dvrk_drake.analysis.observations.motion_grid import MotionGrid
+from dvrk_drake.analysis.observations.static_poses import ExcludedMeasurement
 from dvrk_drake.analysis.pose_identification import StaticIdentification
-from dvrk_drake.analysis.pose_validation import StaticValidation
-from dvrk_drake.analysis.residual_structure import pose_error_shares, residual_structure
 from dvrk_drake.analysis.results import Identification, Validation
+from dvrk_drake.analysis.validation import StaticValidation
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.recording import Recording

@@ -37,7 +37,6 @@ def motion_page(design: ExcitationDesign, *, next_step: str | None = None) -> Pa
         ("expected error of the best random motion [%]", f"{100 * design.random_error:.2f}"),
         ("base parameters known to 10 %", f"{design.known_parameters} of {design.num_parameters}"),
         ("condition number", f"{design.condition_number:.3g}"),
-        ("information per parameter (log-determinant)", f"{design.log_determinant:.2f}"),
     ]
     note = (
         "The expected error is that of the efforts which an identified model predicts for random motions within the "

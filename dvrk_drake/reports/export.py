@@ -10,14 +10,12 @@ from numpy.typing import NDArray
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.model_links import ModelBodies
-from dvrk_drake.export.drive_approximation import DriveApproximation
-from dvrk_drake.export.dvrk_mtm_controller import MTM_JOINTS
 from dvrk_drake.export.dvrk_mtm_gravity_compensation import POSES, compensation_loss
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import CompensationComparison, JointComparison
-from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
+from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import MTM_JOINTS, GravityCompensationFile
 from dvrk_drake.export.dvrk_psm_gravity_compensation import ARM_JOINTS, NAMES, KinematicCompensation
 from dvrk_drake.export.gravity_compensation_loss import ROUNDING, CompensationLoss
-from dvrk_drake.export.model_export import ModelExport
+from dvrk_drake.export.model_export import DriveApproximation, ModelExport
 from dvrk_drake.export.model_writer import LinkChange, changed_links
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.reports.colours import FITTED, LIMIT, NEUTRAL, REFERENCE, SERIES

@@ -103,7 +103,7 @@ def _gravity_parameters(model: IdentifiedModel) -> Table:
 
 
 def _base_parameters(section: DynamicSection, regressor: DynamicRegressor) -> list[Block]:
-    base = derive_base_parameters(regressor, coupled_rotors=False)
+    base = derive_base_parameters(regressor)
     B = base.combination
     nominal = dict(zip(base.base.names, B @ regressor.values[: B.shape[1]], strict=True))
     rows: list[tuple[Cell, ...]] = []

@@ -11,9 +11,9 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem, ValueProducer
 
 from dvrk_drake.dynamics.compiled import entry_point
+from dvrk_drake.dynamics.friction_compensation import MAX_SLIP_SHARE, slip_effort
 from dvrk_drake.dynamics.holding_torque import HoldingArrays
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.dynamics.slip_effort import MAX_SLIP_SHARE, slip_effort
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.models.arm_schema import Gains
 from dvrk_drake.systems.gravity_pid_step import controller_step

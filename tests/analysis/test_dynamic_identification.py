@@ -116,7 +116,7 @@ def test_true_base_parameters_and_rotors_lie_in_their_intervals(case):
 def test_base_parameters_of_the_motion_lie_in_their_intervals(case):
     """All identifiable parameters of links and rotors, by name."""
     _, truth, _, result = case
-    base = derive_base_parameters(truth.regressor, coupled_rotors=False)
+    base = derive_base_parameters(truth.regressor)
     found = result.model.dynamics.base_parameters
     assert [p.name for p in found] == list(base.base.names)
     beta = base.combination @ truth.parameters[: base.combination.shape[1]]

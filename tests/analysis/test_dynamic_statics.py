@@ -16,9 +16,8 @@ from dvrk_drake.dynamics.actuator_effects import (
     joint_row,
 )
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
-from dvrk_drake.dynamics.holding_torque import holding_torque_into
+from dvrk_drake.dynamics.holding_torque import holding_torque_into, static_model
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, JointStatistics
-from dvrk_drake.dynamics.static_model import static_model
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effect_kinds import POSITION_KINDS

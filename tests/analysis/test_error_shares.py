@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dvrk_drake.analysis.motion_validation import SHARE_LABELS, ErrorShares, error_shares
+from dvrk_drake.analysis.error_shares import SHARE_LABELS, ErrorShares, error_shares
 from dvrk_drake.analysis.observations.noise import MOTION_FREQUENCY
 
 pytestmark = pytest.mark.numeric

@@ -8,7 +8,7 @@ from robot_file import write_robot
 from robot_motion import robot_motion
 
 import dvrk_drake as dvrk
-from dvrk_drake.analysis.estimation.common_delay import common_delay
+from dvrk_drake.analysis.estimation.motion_effects import common_delay
 from dvrk_drake.analysis.motion_identification import motion_problem
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.dynamics.physical_consistency import WIDENING, bounding_boxes

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dvrk_drake.analysis.residual_structure import MIN_SHARE, residual_structure
+from dvrk_drake.analysis.error_shares import MIN_SHARE, residual_structure
 
 
 @pytest.mark.parametrize(

@@ -77,7 +77,7 @@ def pair(days, tmp_path_factory):
 def test_links_are_those_of_all_days(days, result):
     """95 % intervals of base parameters that the prior alone does not determine cover the true values."""
     truth, _, _ = days
-    B = derive_base_parameters(truth.regressor, coupled_rotors=False).combination
+    B = derive_base_parameters(truth.regressor).combination
     values = B @ truth.parameters[: B.shape[1]]
     z = [
         (e.value - value) / e.standard_error

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from dvrk_drake.analysis.estimation.robust_fit import robust_fit, weighted_fit
-from dvrk_drake.analysis.observations.excluded_measurements import find_excluded
+from dvrk_drake.analysis.observations.static_poses import find_excluded
 from dvrk_drake.analysis.pose_identification import identify_static
-from dvrk_drake.analysis.pose_validation import predict_static, validate_static
+from dvrk_drake.analysis.validation import predict_static, validate_static
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
+from dvrk_drake.dynamics.holding_torque import static_model
 from dvrk_drake.dynamics.identified_model import FORMAT, IdentifiedModel
-from dvrk_drake.dynamics.static_model import static_model
 from dvrk_drake.errors import IdentificationError, ModelError, RecordingError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import DriveEffect

@@ -13,7 +13,7 @@ import pytest
 from command_output import refusal
 from robot_file import write_robot
 
-from dvrk_drake.analysis.pose_validation import validate_static
+from dvrk_drake.analysis.validation import validate_static
 from dvrk_drake.analysis.verdict import (
     MIN_STIFFNESS,
     Tolerance,

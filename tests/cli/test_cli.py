@@ -16,8 +16,8 @@ from recordings import csv_block
 
 from dvrk_drake.analysis.excitation.pose_file import save_poses
 from dvrk_drake.cli import main
+from dvrk_drake.dynamics.holding_torque import static_model
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.dynamics.static_model import static_model
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.sdf_model import MODELS_FOLDER

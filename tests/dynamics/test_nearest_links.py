@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+from dvrk_drake.dynamics.holding_torque import static_model
 from dvrk_drake.dynamics.inertial_parameters import link_inertias
 from dvrk_drake.dynamics.model_links import MIN_EIGENVALUE_RATIO, nearest_links
-from dvrk_drake.dynamics.static_model import static_model
 from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
 from dvrk_drake.models.arm_files import load_arm
 

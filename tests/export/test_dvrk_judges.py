@@ -10,14 +10,13 @@ from dvrk_judge import judge
 
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.export.dvrk_mtm_controller import controller_torque
 from dvrk_drake.export.dvrk_mtm_gravity_compensation import (
     CompensationOptions,
     compensation_from_model,
     compensation_loss,
     dry_friction,
 )
-from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
+from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile, controller_torque
 from dvrk_drake.export.dvrk_psm_gravity_compensation import kinematic_compensation
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import DriveEffect

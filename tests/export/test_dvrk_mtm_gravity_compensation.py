@@ -15,7 +15,6 @@ from dvrk_drake.dynamics.actuator_effects import joint_row
 from dvrk_drake.dynamics.dynamic_section import DynamicSection
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ModelError
-from dvrk_drake.export.dvrk_mtm_controller import controller_torque, unclipped_torque
 from dvrk_drake.export.dvrk_mtm_gravity_compensation import (
     CompensationOptions,
     compensation_from_model,
@@ -23,7 +22,11 @@ from dvrk_drake.export.dvrk_mtm_gravity_compensation import (
     dry_friction,
 )
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation
-from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
+from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import (
+    GravityCompensationFile,
+    controller_torque,
+    unclipped_torque,
+)
 from dvrk_drake.export.gravity_compensation_loss import LEAST_TOLERANCE, accepted_differences
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import DriveEffect

@@ -11,8 +11,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ModelError
-from dvrk_drake.export.drive_approximation import approximate_drives
-from dvrk_drake.export.model_export import export_model
+from dvrk_drake.export.model_export import approximate_drives, export_model
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.models.mjcf import to_mjcf

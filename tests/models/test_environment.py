@@ -6,8 +6,7 @@ from command_output import refusal
 from models_in_directives import OTHER_ARM
 
 import dvrk_drake as dvrk
-from dvrk_drake.analysis.excitation.collisions import CollisionDetector, first_collision
-from dvrk_drake.analysis.excitation.motion_limits import motion_violations
+from dvrk_drake.analysis.excitation.motion_limits import CollisionDetector, first_collision, motion_violations
 from dvrk_drake.analysis.excitation.periodic_motion import PeriodicMotion
 from dvrk_drake.analysis.excitation.pose_file import load_poses, pose_environment, save_poses
 from dvrk_drake.cli import main

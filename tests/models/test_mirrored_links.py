@@ -7,15 +7,14 @@ import pytest
 from command_output import messages, refusal
 
 from dvrk_drake.analysis.pose_identification import identify_static
-from dvrk_drake.analysis.pose_validation import validate_static
+from dvrk_drake.analysis.validation import validate_static
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ModelError
 from dvrk_drake.experiments.reproduction.published import PAPER
-from dvrk_drake.export.dvrk_mtm_controller import controller_torque
 from dvrk_drake.export.dvrk_mtm_gravity_compensation import CompensationOptions, compensation_from_model
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation
-from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
+from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile, controller_torque
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions
 from dvrk_drake.recordings.reading import read_recording

@@ -9,8 +9,8 @@ from figure_rules import checked_figures
 from report_checks import check_report
 
 import dvrk_drake as dvrk
-from dvrk_drake.analysis.baselines import baseline_efforts
 from dvrk_drake.analysis.pose_identification import identify_static
+from dvrk_drake.analysis.validation import baseline_efforts
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.models.effects_schema import half_width

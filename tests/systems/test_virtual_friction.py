@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from dvrk_drake.dynamics.dynamic_section import ActuatorStatistics
+from dvrk_drake.dynamics.friction_compensation import MAX_SLIP_SHARE, is_cross_validated, slip_effort
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.dynamics.slip_effort import MAX_SLIP_SHARE, is_cross_validated, slip_effort
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.arm_schema import Gains

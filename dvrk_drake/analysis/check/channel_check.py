@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.check.channel_fit import OFFSET_DEVIATION, ChannelFit
-from dvrk_drake.analysis.observations.excluded_measurements import find_excluded
 from dvrk_drake.analysis.observations.finding import Finding
 from dvrk_drake.analysis.observations.observations import Observations
-from dvrk_drake.analysis.observations.static_poses import MIN_POSES, average_repeated_poses
+from dvrk_drake.analysis.observations.static_poses import MIN_POSES, average_repeated_poses, find_excluded
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import has_converted_model
 from dvrk_drake.recordings.recording import Recording

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.estimation.common_delay import MIN_ERRORS, MIN_GAIN, minimiser
 from dvrk_drake.analysis.estimation.motion_columns import DIRECTION_WIDTH
-from dvrk_drake.analysis.observations.low_pass import low_pass
+from dvrk_drake.analysis.estimation.motion_effects import MIN_ERRORS, MIN_GAIN
+from dvrk_drake.analysis.observations.low_pass import low_pass, minimiser
 from dvrk_drake.analysis.observations.motion_grid import MotionSignals, ends_of
 from dvrk_drake.analysis.observations.true_time import MAX_ROWS
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.check.effort_lag import CUT_OFF, MAX_LAG, EffortLag, effort_lag
 from dvrk_drake.analysis.check.report import RecordingReport
-from dvrk_drake.analysis.estimation.common_delay import MIN_ERRORS
+from dvrk_drake.analysis.estimation.motion_effects import MIN_ERRORS
 from dvrk_drake.analysis.estimation.motion_estimates import STRONG_CORRELATION
 from dvrk_drake.analysis.observations.finding import Finding, Severity
 from dvrk_drake.analysis.observations.low_pass import resample

@@ -5,10 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.estimation.common_delay import MIN_ERRORS
-from dvrk_drake.analysis.observations.excluded_measurements import find_excluded, usable_measurements
+from dvrk_drake.analysis.estimation.motion_effects import MIN_ERRORS
 from dvrk_drake.analysis.observations.finding import Finding
-from dvrk_drake.analysis.observations.static_poses import MIN_POSES, average_repeated_poses
+from dvrk_drake.analysis.observations.static_poses import (
+    MIN_POSES,
+    average_repeated_poses,
+    find_excluded,
+    usable_measurements,
+)
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import holding_torques
 from dvrk_drake.recordings.recording import MAX_MOTION_STEP, Recording

@@ -14,12 +14,11 @@ from dvrk_drake.analysis.check.mounting import find_mounting, is_assumed
 from dvrk_drake.analysis.check.pose_check import check_poses
 from dvrk_drake.analysis.check.report import JointSignals, RecordingReport
 from dvrk_drake.analysis.motion_validation import find_other_robot, validate_motion
-from dvrk_drake.analysis.observations.excluded_measurements import check_effort_unit
 from dvrk_drake.analysis.observations.finding import Finding, Severity
 from dvrk_drake.analysis.observations.motion_faults import MIN_RETURNS, TIME_UNITS
 from dvrk_drake.analysis.observations.motion_grid import MIN_DURATION
 from dvrk_drake.analysis.observations.observations import Observations
-from dvrk_drake.analysis.observations.static_poses import MIN_POSES, usable_poses
+from dvrk_drake.analysis.observations.static_poses import MIN_POSES, check_effort_unit, usable_poses
 from dvrk_drake.analysis.observations.true_time import SAME_VALUE, distinct_rows, repeated_rows, time_factor
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import IdentificationError, RecordingError

@@ -281,7 +281,7 @@ def motion_parameters(
     below `MIN_IDENTIFIABILITY` are omitted.
     """
     p = problem.num_rigid
-    base = derive_base_parameters(problem.regressor, coupled_rotors=False)
+    base = derive_base_parameters(problem.regressor)
     B = base.combination
     prior_variances = np.einsum("bp,pq,bq->b", B, covariance.prior[:p, :p], B)
     # Effects with coefficient 0, which is their lower bound, are omitted.

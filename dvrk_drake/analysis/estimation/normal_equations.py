@@ -143,10 +143,10 @@ class NormalEquations:
         """Sums over all rows."""
         return self._sums(np.ones((self.folds, 3)))
 
-    def of_fold(self, fold: int, count: int = 1) -> SquareSums:
-        """Returns the sums over the rows of `count` adjacent folds that start with `fold`."""
+    def of_fold(self, fold: int) -> SquareSums:
+        """Returns the sums over the rows of one fold."""
         kept = np.zeros((self.folds, 3))
-        kept[np.arange(fold, fold + count) % self.folds] = 1.0
+        kept[fold] = 1.0
         return self._sums(kept)
 
     def without_fold(self, fold: int, count: int = 1) -> SquareSums:

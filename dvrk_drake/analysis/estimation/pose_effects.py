@@ -17,7 +17,7 @@ from dvrk_drake.dynamics.actuator_effects import (
     position_along,
     spring_over,
 )
-from dvrk_drake.dynamics.static_model import StaticModel, static_model
+from dvrk_drake.dynamics.holding_torque import StaticModel, static_model
 from dvrk_drake.models.arm import Arm
 
 #: Prior standard deviation of a base parameter, as a share of the value at which this parameter alone produces the

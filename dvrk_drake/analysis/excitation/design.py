@@ -62,7 +62,6 @@ class ExcitationDesign(Reportable):
             efforts, see `MotionInformation.expected_error`.
         known_parameters: Number of base parameters with a standard error of at most 10 %.
         num_parameters: Number of base parameters.
-        log_determinant: See `ExpectedError.log_determinant` (D-optimality).
         condition_number: See `MotionInformation.condition_number`.
         random_error: Smallest expected error of the random motions from which the optimisation started.
     """
@@ -72,7 +71,6 @@ class ExcitationDesign(Reportable):
     expected_error: float
     known_parameters: int
     num_parameters: int
-    log_determinant: float
     condition_number: float
     random_error: float
 
@@ -174,7 +172,6 @@ def design_excitation(
         expected_error=criterion.after(matrix),
         known_parameters=criterion.known_parameters(matrix),
         num_parameters=information.num_base,
-        log_determinant=criterion.log_determinant(matrix),
         condition_number=information.condition_number(state),
         random_error=min(result[2] for result in results),
     )

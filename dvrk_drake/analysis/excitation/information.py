@@ -69,11 +69,6 @@ class ExpectedError:
         errors = np.sqrt(np.diag(self.covariance(information))[: len(self.base_values)])
         return int(np.sum(errors <= 0.1 * np.abs(self.base_values)))
 
-    def log_determinant(self, information: NDArray[np.float64]) -> float:
-        """Returns the gain in log-determinant of the precision over the prior, divided by the number of unknowns."""
-        gain = np.linalg.slogdet(self.prior + information)[1] - np.linalg.slogdet(self.prior)[1]
-        return float(gain) / len(self.prior)
-
 
 @dataclass(frozen=True, eq=False)
 class MotionInformation:
@@ -190,7 +185,7 @@ class MotionInformation:
             return earlier
         section = self.model.dynamics
         regressor = self._regressor.with_gravity(section.gravity_expected or section.gravity)
-        derived = derive_base_parameters(regressor, coupled_rotors=False)
+        derived = derive_base_parameters(regressor)
         row_of = dict(zip(derived.base.names, derived.combination @ np.linalg.pinv(self._base.base), strict=True))
         for estimate in section.base_parameters:
             if estimate.standard_error > 0 and estimate.name in row_of:

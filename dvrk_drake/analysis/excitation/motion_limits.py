@@ -1,4 +1,4 @@
-"""Limits of a designed motion, and a check of a motion that is independent of its design."""
+"""Limits and collisions of a designed motion, and a check of a motion that is independent of its design."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.multibody.tree import RigidBody
+from pydrake.systems.framework import DiagramBuilder
 
-from dvrk_drake.analysis.excitation.collisions import CollisionDetector, first_collision
 from dvrk_drake.analysis.excitation.periodic_motion import PeriodicMotion
 from dvrk_drake.analysis.excitation.predicted_effort import PredictedEffort
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -17,8 +19,76 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import is_from_model_file
 from dvrk_drake.models.arm_schema import POSITIONS
 from dvrk_drake.models.environment import Environment
+from dvrk_drake.models.plant import add_arm, base_body, set_arm_positions
 from dvrk_drake.models.ranges import number_fault, within
 from dvrk_drake.models.soft_walls import SoftWalls
+
+
+class CollisionDetector:
+    """Detects collisions at poses of one arm.
+
+    Pairs of links are checked, except those that the collision filters of the SDF exclude. In the arms of this package,
+    all pairs are excluded.
+    """
+
+    def __init__(self, arm: Arm, environment: Environment = Environment()) -> None:
+        """Constructs the detector.
+
+        Args:
+            arm: Arm with collision shapes.
+            environment: Fixed objects around the arm.
+        """
+        self._arm = arm
+        builder = DiagramBuilder()
+        self._plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 1e-3)
+        self._instance = add_arm(self._plant, arm)
+        environment.add_to(self._plant)
+        self._plant.Finalize()
+        self._diagram = builder.Build()
+        self._context = self._diagram.CreateDefaultContext()
+        self._query_port, self._inspector = scene_graph.get_query_output_port(), scene_graph.model_inspector()
+        self._graph_context = scene_graph.GetMyMutableContextFromRoot(self._context)
+        self._plant_context = self._plant.GetMyMutableContextFromRoot(self._context)
+
+    def tip(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Returns the position (3,) of the tip, the frame `Arm.frames.hand`, in the base frame at a pose (n,) [m]."""
+        set_arm_positions(self._plant, self._plant_context, self._arm, pose, self._instance)
+        frame = self._plant.GetFrameByName(self._arm.frames.hand, self._instance)
+        return np.asarray(frame.CalcPoseInWorld(self._plant_context).translation())
+
+    def collision(self, pose: NDArray[np.float64]) -> str:
+        """Returns the description of the first collision at a pose (n,), or "" if there is none."""
+        plant, inspector, base = self._plant, self._inspector, base_body(self._plant, self._instance)
+        set_arm_positions(plant, self._plant_context, self._arm, pose, self._instance)
+        for pair in self._query_port.Eval(self._graph_context).ComputePointPairPenetration():
+            ids = pair.id_A, pair.id_B
+            bodies = [plant.GetBodyFromFrameId(inspector.GetFrameId(geometry)) for geometry in ids]
+            bodies.sort(key=lambda body: (body.model_instance() != self._instance, body.name()))
+            # The base is mounted at the table or at another object, and objects may touch each other.
+            if all(body.model_instance() != self._instance or body is base for body in bodies):
+                continue
+            return f"collision of {' and '.join(map(self._name, bodies))}"
+        return ""
+
+    def _name(self, body: RigidBody) -> str:
+        if body.model_instance() == self._instance:
+            return str(body.name())
+        return "the table" if body.index() == self._plant.world_body().index() else str(body.scoped_name().get_full())
+
+
+def first_collision(
+    arm: Arm, q: NDArray[np.float64], environment: Environment = Environment()
+) -> tuple[int, str] | None:
+    """Returns the index of the first pose with a collision and its description, or None.
+
+    Args:
+        arm: Arm with collision shapes.
+        q: Poses (m, n) [rad, m].
+        environment: Fixed objects around the arm.
+    """
+    detector = CollisionDetector(arm, environment)
+    return next(((i, what) for i, pose in enumerate(q) if (what := detector.collision(pose))), None)
+
 
 #: Rate at which a motion is checked [Hz], and accepted rounding error of a limit, relative to the width of its range.
 #: Between the times, the highest possible harmonic (20 Hz) grows by at most 0.2 % of its amplitude.

@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.estimation.pose_effects import MIN_TORQUE, StaticProblem, candidate_effects
-from dvrk_drake.analysis.excitation.collisions import CollisionDetector
 from dvrk_drake.analysis.excitation.information import ExpectedError
-from dvrk_drake.analysis.excitation.motion_limits import PATH_STEP, ROUNDING, MotionLimits
+from dvrk_drake.analysis.excitation.motion_limits import PATH_STEP, ROUNDING, CollisionDetector, MotionLimits
 from dvrk_drake.analysis.excitation.pose_file import save_poses
 from dvrk_drake.analysis.excitation.predicted_effort import PredictedEffort
 from dvrk_drake.analysis.excitation.random_motion import middle_pose

@@ -1,4 +1,4 @@
-"""Zero-phase filters, differentiation, resampling and correlation."""
+"""Zero-phase filters, differentiation, resampling, correlation, and the minimum of a sampled curve."""
 
 from __future__ import annotations
 
@@ -69,3 +69,12 @@ def resample(t: NDArray[np.float64], x: NDArray[np.float64], times: NDArray[np.f
         result[start : start + len(part)] = PchipInterpolator(t[first:last], x[first:last], axis=0)(part)
         start += len(part)
     return result
+
+
+def minimiser(x: NDArray[np.number], values: NDArray[np.float64]) -> float:
+    """Returns the minimiser of a curve with given values at equidistant x, from parabolic interpolation."""
+    i = int(np.clip(np.argmin(values), 1, len(values) - 2))
+    before, minimum, after = values[i - 1 : i + 2]
+    curvature = before - 2 * minimum + after
+    offset = 0.5 * (before - after) / curvature if curvature > 0 else 0.0
+    return float(x[i] + np.clip(offset, -1, 1) * (x[1] - x[0]))

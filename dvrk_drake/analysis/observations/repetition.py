@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 
-from dvrk_drake.analysis.observations.low_pass import low_pass, resample
+from dvrk_drake.analysis.observations.low_pass import low_pass, minimiser, resample
 from dvrk_drake.analysis.observations.motion_grid import MotionGrid, ends_of
 from dvrk_drake.recordings.recording import SAME_POSE
 
@@ -56,9 +56,8 @@ def find_period(q: NDArray[np.float64], rate: float) -> float | None:
     candidates = np.flatnonzero(is_minimum) + 2
     near = candidates[candidates < 1.5 * candidates[0]]
     lag = int(near[np.argmin(difference[near])])
-    before, at, after = difference[lag - 1 : lag + 2]
-    curvature = before - 2 * at + after
-    return float((lag + (0.5 * (before - after) / curvature if curvature > 0 else 0.0)) / rate)
+    around = np.arange(lag - 1, lag + 2)
+    return minimiser(around, difference[around]) / rate
 
 
 def repeatability_floor(

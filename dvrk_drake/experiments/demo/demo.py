@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 import dvrk_drake as dvrk
 from dvrk_drake.analysis.pose_identification import StaticIdentification
-from dvrk_drake.analysis.pose_validation import StaticValidation
+from dvrk_drake.analysis.validation import StaticValidation
 from dvrk_drake.errors import ArmError
 from dvrk_drake.experiments.ground_truth import APPROACH
 from dvrk_drake.experiments.releases import BAND

@@ -8,8 +8,8 @@ from check_findings import ARMS, changed, found
 from synthetic_motion import clean_motion
 
 from dvrk_drake.analysis.check.recording_check import check_recording
-from dvrk_drake.analysis.observations.excluded_measurements import check_effort_unit
 from dvrk_drake.analysis.observations.observations import Observations
+from dvrk_drake.analysis.observations.static_poses import check_effort_unit
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.recording import Recording

@@ -66,9 +66,8 @@ def test_gradient_is_the_derivative(information, state):
 def test_more_information_gives_a_smaller_error(information, state):
     once, twice = (information.expected_error(state, period) for period in (PERIOD, 2 * PERIOD))
     assert twice < once
-    criterion, matrices = information.criterion, [information.matrix(state, k * PERIOD) for k in (1, 2, 1e5)]
-    assert criterion.known_parameters(matrices[2]) >= criterion.known_parameters(matrices[0])
-    assert criterion.log_determinant(matrices[1]) > criterion.log_determinant(matrices[0]) > 0
+    criterion, matrices = information.criterion, [information.matrix(state, k * PERIOD) for k in (1, 1e5)]
+    assert criterion.known_parameters(matrices[1]) >= criterion.known_parameters(matrices[0])
     at_rest = state.copy()
     at_rest[1:] = 0.0
     assert information.expected_error(at_rest, PERIOD) > once

@@ -8,8 +8,7 @@ from command_output import refusal
 
 import dvrk_drake as dvrk
 from dvrk_drake.analysis.excitation import static_poses
-from dvrk_drake.analysis.excitation.collisions import CollisionDetector, first_collision
-from dvrk_drake.analysis.excitation.motion_limits import MotionLimits, tip_positions
+from dvrk_drake.analysis.excitation.motion_limits import CollisionDetector, MotionLimits, first_collision, tip_positions
 from dvrk_drake.analysis.excitation.pose_file import load_poses
 from dvrk_drake.analysis.excitation.static_poses import (
     MARGIN,

@@ -7,7 +7,7 @@ import pytest
 from motions import friction_everywhere, true_dynamics
 
 import dvrk_drake.analysis.observations.motion_grid as motion_grid_module
-from dvrk_drake.analysis.observations.drive_efforts import drive_efforts
+from dvrk_drake.analysis.observations.motion_difference import drive_efforts
 from dvrk_drake.analysis.observations.motion_grid import GRID_RATE
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.observations.repetition import CORRELATION_TIME, FOLDS, phase_folds

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dvrk_drake.analysis.check.effort_lag import CUT_OFF, effort_lag
-from dvrk_drake.analysis.observations.drive_efforts import refuse_opposite_efforts
+from dvrk_drake.analysis.observations.motion_difference import refuse_opposite_efforts
 from dvrk_drake.analysis.observations.motion_grid import MotionSignals, motion_signals
 from dvrk_drake.analysis.observations.true_time import increasing_times, repeated_rows, true_time, velocity_agreement
 from dvrk_drake.errors import RecordingError

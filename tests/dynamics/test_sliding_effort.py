@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from dvrk_drake.dynamics.actuator_effects import joint_row, position_along
-from dvrk_drake.dynamics.drive_curves import friction_curve, position_curve
+from dvrk_drake.dynamics.actuator_effects import joint_row, position_along, sliding_effort
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import DriveEffect
@@ -21,13 +20,12 @@ def test_friction_at_constant_speed():
         DriveEffect(NAME, "presliding", 0.01, 0.1),
         DriveEffect(NAME, "presliding forward", 0.01, 0.04),
         DriveEffect(NAME, "load coulomb", 0.05, 0.5),
-        DriveEffect("actuator.wrist_roll", "viscous", 0.0, 9.0),
         DriveEffect(NAME, "offset", 0.0, 9.0),
     ]
     v = np.array([-2.0, -0.02, 0.0, 0.02, 2.0])
     smoothed = np.tanh(v / 0.05)
-    expected = 0.2 * v + (0.3 + 0.5 * 0.6) * smoothed + 0.1 * np.sign(v) + 0.04 * (v > 0)
-    np.testing.assert_allclose(friction_curve(effects, NAME, v, load=0.6), expected, atol=1e-12)
+    expected = 9.0 + 0.2 * v + (0.3 + 0.5 * 0.6) * smoothed + 0.1 * np.sign(v) + 0.04 * (v > 0)
+    np.testing.assert_allclose(sliding_effort(effects, 0.3, v, load=0.6), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["mtml", "psm"])
@@ -38,7 +36,8 @@ def test_position_curves_add_up_to_the_holding_torque(name):
     q = arm.sample_poses(20, np.random.default_rng(0))
     tau = np.zeros_like(q)
     for coordinate in dict.fromkeys(e.coordinate for e in effects):
-        curve = position_curve(effects, coordinate, position_along(arm, coordinate, q))
+        own = [e for e in effects if e.coordinate == coordinate]
+        curve = sliding_effort(own, position_along(arm, coordinate, q), np.zeros(len(q)))
         tau += curve[:, None] * joint_row(arm, coordinate)
     assert np.any(tau)
     np.testing.assert_allclose(tau, with_effects.holding_torque(q) - without.holding_torque(q), atol=1e-9)

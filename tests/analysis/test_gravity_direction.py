@@ -7,7 +7,7 @@ import pytest
 from command_output import refusal
 
 import dvrk_drake as dvrk
-from dvrk_drake.analysis.estimation.gravity_direction import LARGE_TILT, estimate_gravity
+from dvrk_drake.analysis.identification import LARGE_TILT, gravity_direction
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.errors import IdentificationError
@@ -38,7 +38,7 @@ def poses(gravity, seed=0, count=40, share=1.0, noise=0.001):
 @pytest.mark.slow
 def test_interval_contains_the_tilt():
     """If 95 % of the intervals contain the tilt, fewer than 5 of 8 do so in 4e-4 of all cases."""
-    found = [estimate_gravity(poses(TILTED, seed), ARM) for seed in range(8)]
+    found = [gravity_direction(poses(TILTED, seed), ARM) for seed in range(8)]
     tilts = np.array([direction.tilt for direction in found])
     half_widths = np.array([direction.half_width for direction in found])
     assert np.sum(np.abs(tilts - np.deg2rad(30.0)) < half_widths) >= 5
@@ -50,7 +50,7 @@ def test_interval_contains_the_tilt():
 
 def test_upright_arm_is_not_reported():
     for seed in range(2):
-        direction = estimate_gravity(poses(ARM.gravity, seed), ARM)
+        direction = gravity_direction(poses(ARM.gravity, seed), ARM)
         assert direction.tilt < LARGE_TILT and not direction.is_large
 
 
@@ -92,4 +92,4 @@ def test_narrow_poses_do_not_determine_the_direction():
     with pytest.raises(IdentificationError, match=r"do not determine the direction of gravity: .* Measure the tilt"):
         dvrk.identify(recording, ARM, estimate_gravity=True)
     upright = poses(ARM.gravity, share=0.05, noise=0.01)
-    assert not estimate_gravity(upright, ARM).is_large
+    assert not gravity_direction(upright, ARM).is_large
