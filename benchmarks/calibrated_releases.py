@@ -11,7 +11,7 @@ rested for 0.5 s and let go. These motions load the friction. The hand is compli
 The models are static.yaml and model.yaml of the calibration, the exact model, the exact model with all masses 20 %
 larger, and a model that is identified from one simulated motion that was designed for it. In the exact and the wrong
 model, the cross-validated error is the RMS error of the model at the poses, as `validate` would measure it. The model
-from a motion contains no such error, so its slip effort is the dry friction of the arm. Poses at which the exact
+from a motion states the error of the efforts in motion. Poses at which the exact
 holding effort exceeds the limit of a motor are omitted, because no model can hold the arm there.
 """
 

@@ -115,6 +115,8 @@ def gravity_vector(_: object, tokens: Sequence[Token]) -> tuple[float, float, fl
     if len(keywords) > 1:
         raise ValueError("--gravity and --mount exclude each other; give one of them")
     is_file = keywords == {"--mount"} and len(words) == 1 and words[0].lower().endswith(".json")
+    if keywords == {"--mount"} and len(words) == 1 and words[0].startswith("/") and not is_file:
+        return _topic_gravity(words[0])
     try:
         numbers = [_mounting_pitch(words[0])] if is_file else [float(word) for word in words]
     except ValueError as error:
@@ -123,11 +125,21 @@ def gravity_vector(_: object, tokens: Sequence[Token]) -> tuple[float, float, fl
         from dvrk_drake.models.mounting import mount_gravity
 
         if len(numbers) not in (1, 3) or not all(abs(x) <= 2 * math.pi for x in numbers):
-            raise ValueError("--mount needs roll, pitch and yaw, or mounting_pitch, within -6.28..6.28 rad, or a file")
+            raise ValueError("--mount needs roll, pitch and yaw, or mounting_pitch, within -6.28..6.28 rad, a file, or a topic")
         return mount_gravity(*numbers)
     if len(numbers) != 3:
         raise ValueError("--gravity needs three numbers [m/s^2]")
     return numbers[0], numbers[1], numbers[2]
+
+
+def _topic_gravity(topic: str) -> tuple[float, float, float]:
+    from dvrk_drake.errors import DvrkDrakeError
+    from dvrk_drake.systems.ros.mount_topic import topic_gravity
+
+    try:
+        return topic_gravity(topic)
+    except DvrkDrakeError as error:
+        raise ValueError(str(error)) from None
 
 
 def _mounting_pitch(path: str) -> float:
@@ -143,7 +155,8 @@ def _mounting_pitch(path: str) -> float:
 
 GRAVITY_HELP = (
     "Gravity vector in the base frame of the arm [m/s^2], for a tilted base. With --mount instead: roll, pitch and yaw "
-    "of the base [rad], mounting_pitch of the dVRK [rad], or the configuration of the arm in the dVRK (JSON)."
+    "of the base [rad], mounting_pitch of the dVRK [rad], the configuration of the arm in the dVRK (JSON), or a ROS 2 "
+    "topic of its setup joints, e.g. /SUJ/PSM1/local/measured_cp."
 )
 Gravity = Annotated[
     tuple[float, float, float] | None,
