@@ -125,7 +125,7 @@ def gravity_vector(_: object, tokens: Sequence[Token]) -> tuple[float, float, fl
         from dvrk_drake.models.mounting import mount_gravity
 
         if len(numbers) not in (1, 3) or not all(abs(x) <= 2 * math.pi for x in numbers):
-            raise ValueError("--mount needs roll, pitch and yaw, or mounting_pitch, within -6.28..6.28 rad, a file, or a topic")
+            raise ValueError("--mount needs roll, pitch and yaw, or mounting_pitch, up to 6.28 rad, a file, or a topic")
         return mount_gravity(*numbers)
     if len(numbers) != 3:
         raise ValueError("--gravity needs three numbers [m/s^2]")

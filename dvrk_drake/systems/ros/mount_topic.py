@@ -13,7 +13,7 @@ from dvrk_drake.systems.ros.open_domain import open_ros_domain
 if TYPE_CHECKING:
     from dvrk_drake.systems.ros.domain import RosDomain
 
-#: Longest time until the first message [s]. The discovery of a topic takes up to 2 s, and setup joints publish at 10 Hz.
+#: Longest time until the first message [s]. Discovery takes up to 2 s, and setup joints publish at about 10 Hz.
 _FIRST = 5.0
 #: Largest difference of the norm of a quaternion from 1. A dVRK publishes 64-bit numbers.
 _NORM_TOLERANCE = 1e-3
