@@ -223,7 +223,7 @@ def test_mounting_is_a_gravity_vector(words, expected, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--mount", "45"], "--mount needs roll, pitch and yaw, or mounting_pitch, within -6.28..6.28 rad"),
+        (["--mount", "45"], "--mount needs roll, pitch and yaw, or mounting_pitch, up to 6.28 rad"),
         (["--mount", "1", "2"], "--mount needs roll, pitch and yaw"),
         (["--mount", "gone.json"], "gone.json"),
         (["--gravity", "0", "1"], "--gravity needs three numbers"),
