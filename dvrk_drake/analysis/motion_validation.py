@@ -58,11 +58,8 @@ class DynamicValidation(Validation):
 
     Attributes:
         actuators: Errors of the actuators, in the arm's order.
-        cut_off: Cut-off of the low-pass filter of the compared efforts [Hz].
         t: Times (r,) of the compared rows [s]. Both ends are omitted (`MotionGrid.inner`).
         q: Positions (r, n) of the actuators [rad, m].
-        v: Velocities (r, n) of the actuators [rad/s, m/s].
-        vd: Accelerations (r, n) of the actuators [rad/s^2, m/s^2].
         period: Period of the motion [s], or None if the motion does not repeat.
         measured: Measured efforts (r, n) after low-pass filtering, see `MotionGrid.channels` [N m, N].
         predicted: Predicted efforts (r, n) after low-pass filtering [N m, N].
@@ -70,11 +67,8 @@ class DynamicValidation(Validation):
     """
 
     actuators: list[ActuatorError]
-    cut_off: float
     t: NDArray[np.float64]
     q: NDArray[np.float64]
-    v: NDArray[np.float64]
-    vd: NDArray[np.float64]
     period: float | None
     measured: NDArray[np.float64]
     predicted: NDArray[np.float64]
@@ -97,7 +91,7 @@ class DynamicValidation(Validation):
             "verdict": self.verdict,
             "rule": rule_text(),
             "coordinates": "actuator",
-            "cut_off_hz": self.cut_off,
+            "cut_off_hz": self.grid.settings.effort_cut_off,
             "mean_relative_error": self.mean_relative_error,
             "actuators": [{**asdict(actuator), "shares": actuator.shares._asdict()} for actuator in self.actuators],
         }
@@ -162,11 +156,8 @@ def validate_motion(model: IdentifiedModel, observations: Observations) -> Dynam
         model=model,
         recording=observations.recording,
         actuators=actuators,
-        cut_off=grid.settings.effort_cut_off,
         t=t,
         q=a,
-        v=v,
-        vd=vd,
         period=period,
         measured=measured,
         predicted=predicted,

@@ -267,7 +267,7 @@ def _validated_motion(validation: DynamicValidation, efforts: Efforts) -> list[B
             f"the interval of another day. {validation.model.interval_scope}",
             show="details",
         ),
-        Text(f"{rule_text()} Low-pass filter: {validation.cut_off:g} Hz.", show="details"),
+        Text(f"{rule_text()} Low-pass filter: {validation.grid.settings.effort_cut_off:g} Hz.", show="details"),
     ]
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
-from functools import cached_property
-from itertools import pairwise
+from functools import cache, cached_property
 from pathlib import Path
 
 import numpy as np
@@ -49,9 +48,6 @@ NUM_TARGETS, NUM_RANDOM = 2000, 20
 #: Smallest relative reduction of the squared expected error by an exchange. Half or twice the value gives the same
 #: expected error for 30 poses of an MTML.
 _MIN_REDUCTION = 1e-6
-#: Travel that replaces the travel of a blocked path, in units of the position ranges. It exceeds the travel of all
-#: other paths together, because a path is at most one range long and there are at most `MAX_POSES` of them.
-_BLOCKED = 1e3
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,10 +137,9 @@ def design_poses(
     chosen = information.select(count, usable)
     random = np.random.default_rng([seed, 1])
     errors = [information.expected_error(random.permutation(len(pool))[:count]) for _ in range(NUM_RANDOM)]
-    blocked: set[tuple[int, int]] = set()
     while True:
         share(0.6)
-        chosen, excluded = _ordered(checker, pool, chosen, blocked)
+        chosen, excluded = _ordered(checker, pool, chosen)
         if not excluded:
             break
         usable[excluded] = False
@@ -411,66 +406,36 @@ def _without_efforts(arm: Arm, q: NDArray[np.float64]) -> StaticProblem:
     return StaticProblem(arm, q, np.zeros_like(q), np.ones(q.shape, bool))
 
 
-def _ordered(
-    checker: PoseChecker, pool: NDArray[np.float64], chosen: list[int], blocked: set[tuple[int, int]]
-) -> tuple[list[int], list[int]]:
-    """Returns the chosen poses in the order of a short path without collisions, and a list of poses to exclude.
+def _ordered(checker: PoseChecker, pool: NDArray[np.float64], chosen: list[int]) -> tuple[list[int], list[int]]:
+    """Returns the chosen poses in the order of a short path without collisions, and the poses that it does not reach.
 
-    If there is no such path, the list contains the pose that most of the blocked paths begin or end at.
+    Each pose is inserted where it lengthens the path least, among the places with free paths to its neighbours.
 
     Args:
         checker: Checker of the paths.
         pool: Poses (k, n).
         chosen: Indices of the chosen poses.
-        blocked: Pairs of poses without a free path between them. New pairs are added.
     """
-    travel, free = checker.travel(pool[chosen]), set[tuple[int, int]]()
-    index = {k: i for i, k in enumerate(chosen)}
-    while True:
-        for a, b in blocked:
-            if a in index and b in index:
-                travel[index[a], index[b]] = _BLOCKED
-        order = [chosen[i] for i in short_path(travel)]
-        pairs = list(pairwise(order))
-        if any(pair in blocked for pair in pairs):
-            ends = Counter(k for pair in blocked for k in pair if k in index)
-            return order, [ends.most_common(1)[0][0]]
-        new = {(a, b) for a, b in pairs if (a, b) not in free and not checker.can_follow(pool[a], pool[b])}
-        if not new:
-            return order, []
-        blocked |= new
-        free |= set(pairs) - new
+    travel = checker.travel(pool[chosen])
 
+    @cache
+    def is_free(a: int, b: int) -> bool:
+        return checker.can_follow(pool[chosen[a]], pool[chosen[b]])
 
-def short_path(travel: NDArray[np.float64]) -> list[int]:
-    """Returns an order of m points with a short total travel: best nearest-neighbour path, improved by 2-opt.
-
-    Args:
-        travel: Travel (m, m) from each point to each other point.
-    """
-    paths = [_nearest_neighbours(travel, first) for first in range(len(travel))]
-    order = np.array(min(paths, key=lambda path: travel[path[:-1], path[1:]].sum()))
-    m = len(order)
-    first, last = np.triu_indices(m, 1)
-    while True:
-        forward = np.concatenate([[0.0], np.cumsum(travel[order[:-1], order[1:]])])
-        backward = np.concatenate([[0.0], np.cumsum(travel[order[1:], order[:-1]])])
-        # Change of the travel if the points from `first` to `last` are visited in the opposite order.
-        change = backward[last] - backward[first] - forward[last] + forward[first]
-        before, after = order[np.maximum(first - 1, 0)], order[np.minimum(last + 1, m - 1)]
-        change += np.where(first > 0, travel[before, order[last]] - travel[before, order[first]], 0.0)
-        change += np.where(last < m - 1, travel[order[first], after] - travel[order[last], after], 0.0)
-        best = int(np.argmin(change))
-        if change[best] > -ROUNDING:
-            return [int(i) for i in order]
-        i, j = first[best], last[best]
-        order[i : j + 1] = order[i : j + 1][::-1].copy()
-
-
-def _nearest_neighbours(travel: NDArray[np.float64], first: int) -> list[int]:
-    path, left = [first], np.ones(len(travel), bool)
-    left[first] = False
-    while left.any():
-        path.append(int(np.argmin(np.where(left, travel[path[-1]], np.inf))))
-        left[path[-1]] = False
-    return path
+    order: list[int] = []
+    excluded: list[int] = []
+    for k in range(len(chosen)):
+        places = []
+        for i in range(len(order) + 1):
+            before, after = order[max(i - 1, 0) : i], order[i : i + 1]
+            links = [*((a, k) for a in before), *((k, b) for b in after)]
+            replaced = sum(travel[a, b] for a in before for b in after)
+            places.append((sum(travel[link] for link in links) - replaced, i, links))
+        place = next((i for _, i, links in sorted(places) if all(is_free(*link) for link in links)), None)
+        if place is None:
+            excluded.append(k)
+        else:
+            order.insert(place, k)
+    if len(excluded) > len(order):  # the first poses are isolated from all others
+        order, excluded = excluded, order
+    return [chosen[k] for k in order], [chosen[k] for k in excluded]

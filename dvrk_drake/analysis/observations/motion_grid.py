@@ -71,27 +71,26 @@ def motion_signals(
     clock: TrueTime,
     acceleration_cut_off: ArrayLike,
     *,
-    cut_off: float = 50.0,
     rate: float = GRID_RATE,
 ) -> MotionSignals:
     """Resamples a motion at a constant rate and computes velocities and accelerations.
 
     Rows that repeat the previous row are omitted. The signals are interpolated at `rate`, and q and v are filtered at
-    `cut_off`. The acceleration vd is the central difference of v, filtered at `acceleration_cut_off`.
+    `SignalSettings.position_cut_off`. The acceleration vd is the central difference of v, filtered at
+    `acceleration_cut_off`.
 
     Args:
         recording: Motion with t and tau, in the coordinates of the result.
         clock: True times of the rows of the recording.
         acceleration_cut_off: Cut-off of the zero-phase low-pass filter for vd [Hz], a scalar or one value (n,) per
             joint.
-        cut_off: Cut-off of the filter for q and v [Hz].
         rate: Rate of the grid [Hz].
 
     Raises:
         RecordingError: The recording has no efforts.
     """
     tau = recording.measured_effort()[clock.rows]
-    t = even_times(clock, rate)
+    t, cut_off = even_times(clock, rate), SignalSettings().position_cut_off
     q = low_pass(resample(clock.t, recording.q[clock.rows], t), rate, cut_off)
     v = central_difference(q, rate)
     agrees = np.zeros(q.shape[1], dtype=bool)

@@ -16,7 +16,6 @@ from dvrk_drake.analysis.excitation.static_poses import (
     PoseChecker,
     PoseInformation,
     _ordered,
-    short_path,
 )
 from dvrk_drake.cli import main
 from dvrk_drake.errors import ExcitationError
@@ -125,44 +124,42 @@ def test_tip_stays_in_the_box():
     np.testing.assert_allclose(CollisionDetector(arm).tip(poses[3]), tip[3], atol=1e-12)
 
 
-def test_order_is_short():
-    generator = np.random.default_rng(0)
-    for _ in range(20):
-        travel = generator.uniform(size=(6, 6))
-
-        def length(order, travel=travel):
-            return travel[list(order[:-1]), list(order[1:])].sum()
-
-        order = short_path(travel)
-        assert sorted(order) == list(range(6))
-        lengths = [length(path) for path in permutations(range(6))]
-        assert length(order) <= np.quantile(lengths, 0.05)
-        # No reversal of a part makes the path shorter.
-        for i in range(6):
-            for j in range(i + 1, 6):
-                assert length(order[:i] + order[i : j + 1][::-1] + order[j + 1 :]) > length(order) - 1e-9
-
-
 class BlockedPaths:
-    """Checker of points on a line that blocks some paths."""
+    """Checker of points in a plane that blocks some paths."""
 
-    def __init__(self, blocked):
+    def __init__(self, blocked=()):
         self.blocked = blocked
 
     def travel(self, poses):
-        return np.abs(poses - poses.T)
+        return np.abs(poses[:, None] - poses).max(axis=2)
 
     def can_follow(self, pose, following):
         return (pose[0], following[0]) not in self.blocked
 
 
+def test_order_is_short():
+    """The path is at most half longer than the shortest one."""
+    generator = np.random.default_rng(0)
+    for _ in range(20):
+        pool = generator.uniform(size=(6, 2))
+        travel = BlockedPaths().travel(pool)
+        order, excluded = _ordered(BlockedPaths(), pool, list(range(6)))
+        shortest = min(travel[path[:-1], path[1:]].sum() for path in map(list, permutations(range(6))))
+        assert sorted(order) == list(range(6)) and not excluded
+        assert travel[order[:-1], order[1:]].sum() < 1.5 * shortest
+
+
 def test_order_avoids_blocked_paths():
     pool = np.arange(5.0)[:, None]
-    order, excluded = _ordered(BlockedPaths({(1.0, 2.0), (2.0, 1.0)}), pool, [0, 1, 2, 3, 4], set())
+    order, excluded = _ordered(BlockedPaths({(1.0, 2.0), (2.0, 1.0)}), pool, [0, 1, 2, 3, 4])
     pairs = list(pairwise(order))
     assert not excluded and sorted(order) == [0, 1, 2, 3, 4] and not {(1, 2), (2, 1)} & set(pairs)
-    isolated = {(a, b) for a in range(5) for b in range(5) if (a == 3) != (b == 3)}
-    assert _ordered(BlockedPaths(isolated), pool, [0, 1, 2, 3, 4], set())[1] == [3]
+
+
+@pytest.mark.parametrize("isolated", [0, 3])
+def test_isolated_poses_are_excluded(isolated):
+    blocked = {(a, b) for a in range(5) for b in range(5) if (a == isolated) != (b == isolated)}
+    assert _ordered(BlockedPaths(blocked), np.arange(5.0)[:, None], [0, 1, 2, 3, 4])[1] == [isolated]
 
 
 @pytest.mark.parametrize(
