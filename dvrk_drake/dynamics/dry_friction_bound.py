@@ -5,13 +5,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.dynamics.actuator_effects import joint_row
+from dvrk_drake.dynamics.actuator_effects import is_prismatic, joint_row
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 
 #: Time constant with which the bound of the friction grows while a joint rests [s]. A reversal of a motion takes less
 #: time, and the presliding elements of the model describe it. `REST_TIME` of mode "guide" has the same length.
 REST_TIME = 0.25
+#: Smallest travel in `REST_TIME` that is a motion [rad], [m]. The presliding travel of gears is shorter, and less than
+#: the noise of a measured velocity.
+MIN_TRAVEL = 5e-4, 1e-4
 
 
 class DryFrictionBound:
@@ -32,8 +35,8 @@ class DryFrictionBound:
     def __init__(self, dynamics: DynamicModel) -> None:
         """Reads the friction of a model.
 
-        A coordinate rests if it travels less than its smallest presliding travel in `REST_TIME`. Without presliding
-        elements, it rests below the smallest speed at which the model has its full friction.
+        A coordinate rests if it travels less than its smallest presliding travel, or `MIN_TRAVEL`, in `REST_TIME`.
+        Without presliding elements, it rests below the smallest speed at which the model has its full friction.
         """
         dry = [
             (effect, coefficient)
@@ -46,9 +49,10 @@ class DryFrictionBound:
         has_state = np.array([effect.kind == "presliding" for effect, _ in dry], bool)
         scales = np.array([effect.scale for effect, _ in dry])
         of_coordinate = np.array([[effect.coordinate == name for effect, _ in dry] for name in names], bool)
+        travels = np.maximum(scales, [MIN_TRAVEL[is_prismatic(dynamics.arm, effect.coordinate)] for effect, _ in dry])
         self._speeds = np.array(
             [
-                np.min(scales[own & has_state]) / REST_TIME if np.any(own & has_state) else np.min(scales[own])
+                np.min(travels[own & has_state]) / REST_TIME if np.any(own & has_state) else np.min(scales[own])
                 for own in of_coordinate
             ]
         )

@@ -82,7 +82,8 @@ class MotionSettings(Shared):
             "asymmetric friction", "load friction" (in proportion to the effort that the drive transmits), "position
             friction" and "position^2 friction" (in proportion to |x| and x^2).
         presliding_travels: Travels before sliding of the presliding friction elements, as multiples of the standard
-            deviation of the position along the coordinate. Used only in a mechanism file.
+            deviation of the position along the coordinate. Gears slide after 0.1 mrad, cables after some mrad. Used
+            only in a mechanism file.
         day_deviation: Standard deviations of the changes of the efforts between days, as shares of the RMS effort [1].
             They widen the prediction intervals on another day than that of the recording. 0 if unknown.
     """
@@ -92,7 +93,7 @@ class MotionSettings(Shared):
     base_may_tilt: bool = False
     known_effects: dict[str, list[str]] = field(default_factory=dict)
     presliding_travels: list[float] = field(
-        default_factory=lambda: [0.003, 0.01, 0.08, 0.3, 1.0], metadata=within(1e-6, 100.0)
+        default_factory=lambda: [0.0001, 0.001, 0.01, 0.08, 0.3, 1.0], metadata=within(1e-6, 100.0)
     )
     day_deviation: list[float] = field(default_factory=list, metadata=within(0.0, 10.0))
 

@@ -49,7 +49,7 @@ class DriveEffect(Shared):
 
     coordinate: str = ""
     kind: str = ""
-    scale: float = field(default=0.0, metadata=within(1e-6, 1000.0, also=(0.0,)))
+    scale: float = field(default=0.0, metadata=within(1e-9, 1000.0, also=(0.0,)))
     coefficient: float = field(default=0.0, metadata=within(-1e6, 1e6, "N m, N m s/rad or N m/rad"))
     standard_error: float = field(default=0.0, kw_only=True, metadata=within(0.0, 1e9))
     degrees_of_freedom: float | None = field(default=None, kw_only=True, metadata=FREEDOMS)

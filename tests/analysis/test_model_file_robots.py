@@ -1,6 +1,7 @@
-"""Assumptions on robots of a model file: delay of the efforts, bounding boxes and presliding friction."""
+"""Assumptions on robots of a model file: delay of the efforts, bounding boxes and friction."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ import dvrk_drake as dvrk
 from dvrk_drake.analysis.estimation.motion_effects import common_delay
 from dvrk_drake.analysis.motion_identification import motion_problem
 from dvrk_drake.analysis.observations.observations import Observations
+from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
+from dvrk_drake.dynamics.dry_friction_bound import MIN_TRAVEL, REST_TIME, DryFrictionBound
 from dvrk_drake.dynamics.physical_consistency import WIDENING, bounding_boxes
 
 
@@ -46,6 +49,18 @@ def test_friction_efforts(arm, motion):
     friction = problem.friction_efforts(used, np.array([5.0, 2.0]))
     expected = 2.0 * np.sqrt(np.mean(problem.columns.shapes[1][:, used[1]] ** 2))
     np.testing.assert_allclose(friction, [0.0, expected, 0.0], rtol=1e-9, atol=1e-12)
+
+
+def test_gears_rest_despite_noise_of_the_velocity(arm):
+    gear = SimpleNamespace(arm=arm, effects=[ActuatorEffect("actuator.turn", "presliding", 1e-5)], coefficients=[2.0])
+    bound = DryFrictionBound(gear)
+    state, q = bound.start(), np.zeros(3)
+    for turn in (0.5, 0.0):  # moves over twice the travel, then rests
+        bound.update(state, q + turn, np.full(3, 1.0), 0.01)
+    noise = 0.1 * MIN_TRAVEL[0] / REST_TIME
+    for _ in range(200):
+        bound.update(state, q, np.full(3, noise), 0.01)
+    np.testing.assert_allclose(bound.covariance(state)[0, 0], 4.0 / 3.0, rtol=0.05, atol=0)
 
 
 def test_boxes_without_collision_shapes_are_wider(tmp_path):
