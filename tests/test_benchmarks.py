@@ -4,7 +4,6 @@ import ast
 import importlib
 import importlib.util
 
-import numpy as np
 import pytest
 from repository import ROOT
 
@@ -42,27 +41,6 @@ def test_functions_are_timed_alternately_after_a_warm_up():
     )
     assert calls == ["before a", "a", "before b", "b"] * 3
     assert {name: len(values) for name, values in times.items()} == {"a": 2, "b": 2}
-
-
-def test_ratio_is_computed_for_each_repetition():
-    timing = load_script("timing")
-    times = {"ours": np.array([1.0, 2.0, 30.0]), "peer": np.array([2.0, 4.0, 60.0])}
-    assert timing.median_ratio(times, "ours", "peer") == 0.5
-
-
-def test_table_columns_are_aligned(capsys):
-    load_script("timing").print_table(
-        "Title", ["us", "ratio"], {"ours": ["1.25", "0.10"], "the peer": ["12.50", "1.00"]}
-    )
-    assert capsys.readouterr().out.splitlines() == [
-        "Title",
-        "",
-        "|          |    us | ratio |",
-        "| -------- | ----: | ----: |",
-        "| ours     |  1.25 |  0.10 |",
-        "| the peer | 12.50 |  1.00 |",
-        "",
-    ]
 
 
 def test_missing_recording_gives_one_line(benchmark, tmp_path):

@@ -84,15 +84,3 @@ def test_no_two_modules_import_each_other():
     modules = {m: {n if n in MODULES else n.rpartition(".")[0] for n in names} - {m} for m, names in imports.items()}
     pairs = [f"{a} and {b}" for a, names in modules.items() for b in names if a < b and a in modules.get(b, ())]
     assert not pairs, "\n".join(pairs)
-
-
-def test_finds_imports_at_all_places():
-    source = """
-import numpy, dvrk_drake.models.arm
-from dvrk_drake.cli import main
-if TYPE_CHECKING:
-    from dvrk_drake.reports.figures.style import save_figure as save
-def late():
-    from dvrk_drake import errors
-"""
-    assert {package_of(name) for name in imports_of(source)} == {"models", "cli", "reports", "errors"}

@@ -47,12 +47,3 @@ def test_each_step_has_a_numbered_bar_on_a_terminal(terminal, capsys):
         assert part in drawn
     captured = capsys.readouterr()
     assert not captured.err and not captured.out
-
-
-def test_finished_bars_are_removed(terminal):
-    names = [f"step{i}" for i in range(support.MAX_BARS + 3)]
-    with Steps(*names) as steps:
-        for name in names:
-            steps(name, 1.0)
-        assert len(steps._progress.tasks) == support.MAX_BARS
-        assert steps._progress.tasks[-1].description == f"{len(names)} of {len(names)}: {names[-1]}"

@@ -67,10 +67,6 @@ def test_null_space_does_not_change_the_torque(reduced, Y):
     assert np.abs(Y @ null.T).max() < 1e-9 * np.abs(Y).max()
 
 
-def test_lift_is_a_right_inverse_of_the_combination(reduced):
-    np.testing.assert_allclose(reduced.combination @ lift(reduced), np.eye(len(reduced.base.names)), rtol=0, atol=1e-9)
-
-
 def test_rank_at_rest_equals_that_of_the_gravity_model(reduced, model):
     """The regressor at rest has the rank of `derive_gravity`, which assumes that the MTM's rotor 4 is balanced."""
     unbalance = {"m_motor_4 c_motor_4_x", "m_motor_4 c_motor_4_y"}

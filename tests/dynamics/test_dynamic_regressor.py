@@ -98,19 +98,6 @@ def test_equals_the_plant_with_other_parameters(arm, seed):
     assert_equal_torque(actual, drake_torque(plant, context, arm, *motion))
 
 
-def test_rotors_act_in_actuator_coordinates(arm):
-    """The joint torque is J' diag(I_a) J vd, where J is the matrix of the transmission."""
-    model = DynamicRegressor(arm)
-    q, v, vd = random_motion(arm, 20)
-    inertias = np.linspace(1e-4, 1e-3, arm.num_joints)
-    parameters = np.zeros(len(model.values))
-    first = 10 * len(model.links)
-    assert model.names[first] == f"rotor.{arm.joint_names[0]}"
-    parameters[first : first + arm.num_joints] = inertias
-    J = arm.transmission.matrix
-    np.testing.assert_allclose(model.torque(q, v, vd, parameters), vd @ J.T * inertias @ J, rtol=1e-12, atol=1e-12)
-
-
 def test_mass_matrix_equals_that_of_the_plant(arm):
     model = DynamicRegressor(arm)
     q, _, _ = random_motion(arm, 20)
@@ -136,13 +123,6 @@ def test_many_samples_equal_single_samples(arm, count):
     assert Y.shape == (count, arm.num_joints, len(model.names))
     single = [model.regressor(*(x[i : i + 1] for x in motion)) for i in range(count)]
     np.testing.assert_allclose(Y, np.reshape(single, Y.shape), rtol=0, atol=1e-12 * np.abs(Y).max(initial=0.0))
-
-
-def test_torque_equals_regressor_times_parameters(arm):
-    model = DynamicRegressor(arm)
-    motion = random_motion(arm, 1500)
-    expected = model.regressor(*motion) @ model.values
-    np.testing.assert_allclose(model.torque(*motion, model.values), expected, rtol=0, atol=1e-12)
 
 
 def test_writes_to_the_output_array(arm):

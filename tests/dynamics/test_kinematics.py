@@ -14,20 +14,6 @@ pytestmark = [pytest.mark.numeric, pytest.mark.drake_api]
 ARMS = ("mtml", "mtmr", "psm")
 
 
-@pytest.mark.parametrize(
-    ("name", "q", "p"),
-    [
-        # Wrist centre of an MTM at zero, and wrist yaw axis of a PSM for two insertions.
-        ("mtml", np.zeros(7), [0.0, -0.3645, -0.1288]),
-        ("mtmr", np.zeros(7), [0.0, -0.3645, -0.1288]),
-        ("psm", np.zeros(7), [0.0, 0.0, 0.0065]),
-        ("psm", [0, 0, 0.1, 0, 0, 0, 0], [0.0, 0.0, -0.0935]),
-    ],
-)
-def test_known_positions(name, q, p):
-    np.testing.assert_allclose(ArmFrame(load_arm(name)).pose(np.array(q, float)).translation(), p, atol=1e-12)
-
-
 def dh(theta, a, alpha, d, modified):
     """Returns the transform of one row of a DH table, standard or modified (Craig)."""
     x = RigidTransform(RotationMatrix.MakeXRotation(alpha), [a, 0, 0])

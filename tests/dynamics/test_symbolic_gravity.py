@@ -133,29 +133,6 @@ def test_symbolic_frames_equal_those_of_the_plant(random_q, name, labels):
             )
 
 
-def test_torque_is_correct_for_random_masses(any_arm, random_q):
-    """The base parameters give the holding torque of the plant with random masses."""
-    arm, gravity = any_arm, derive_gravity(any_arm)
-    plant = make_arm_plant(arm)
-    context = plant.CreateDefaultContext()
-    generator = np.random.default_rng(8)
-    values = gravity.standard_values.copy()
-    labels = [p.label for p in gravity.standard_parameters if not p.axis]
-    # For gravity, the rotor is part of the link that carries the motor.
-    rotors = {"4": [plant.GetBodyByName("motor_4_link")]} if arm.name == "MTMR" else {}
-    for label in labels:
-        k = 4 * labels.index(label)
-        factor = generator.uniform(0.5, 1.5)
-        for body in [plant.GetFrameByName(f"dh_{label}").body(), *rotors.get(label, [])]:
-            body.SetMass(context, body.default_mass() * factor)
-        values[k : k + 4] *= factor
-    model = static_model(arm)
-    for q in random_q:
-        set_arm_positions(plant, context, arm, q)
-        tau = model.torque(q, gravity.base.combination @ values)
-        np.testing.assert_allclose(tau, holding_torque(plant, context, arm), atol=1e-12)
-
-
 def test_joint_effects_add_their_torque(arm):
     effects = (ActuatorEffect("joint.wrist_platform", "cable sine", 1.0), ActuatorEffect("joint.outer_yaw", "offset"))
     plain, model = static_model(arm), static_model(arm, effects)

@@ -42,7 +42,7 @@ from dvrk_drake.reports.image_files import write_images
 from dvrk_drake.reports.page import Page, Plot, Section, Table, Text
 from dvrk_drake.reports.plot import Curve, Panel
 from dvrk_drake.reports.provenance import Provenance
-from dvrk_drake.reports.reproduction import drift, figures
+from dvrk_drake.reports.reproduction import drift
 from dvrk_drake.reports.reproduction import page as reproduction_page
 from dvrk_drake.reports.reproduction.drift import reproduce_figure_5, share
 from dvrk_drake.reports.reproduction.figures import reproduce_transparency
@@ -223,15 +223,6 @@ def test_exact_model_holds_arm_and_zero_torque_does_not(truth):
     np.testing.assert_array_equal(release(truth.arm, truth.exact, start, duration=1.0), held)  # bit for bit
 
 
-@pytest.mark.slow
-def test_ground_truth_arm_matches_its_model(truth):
-    q = ARM.sample_poses(20, np.random.default_rng(7))
-    effects = truth.exact.holding_torque(q) - IdentifiedModel.from_arm(truth.arm).holding_torque(q)
-    assert np.abs(effects[:, 3]).max() > 0.01  # cables
-    nominal = IdentifiedModel.from_arm(ARM).holding_torque(q)
-    assert np.abs(truth.exact.holding_torque(q) - effects - nominal).max() > 0.02  # differs from the nominal model
-
-
 def test_positions_in_damping_term_leave_joint_undamped(tmp_path):
     arm = paper_simulated_arm(ARM, tmp_path / "paper.sdf")
     (faulty, shapes), (correct, _) = oscillation_modes(arm, faulty=True), oscillation_modes(arm, faulty=False)
@@ -320,14 +311,6 @@ def test_compensation_reduces_operator_force(truth, tmp_path):
     force = [float(row[1]) for row in table.rows]
     assert force[0] > force[2] > force[3] > 0  # unpowered, our model, our model with friction compensation
     assert isinstance(plot, Plot)
-
-
-def test_figure_7_shows_ours_first():
-    t = PERIOD * np.arange(2000)
-    q = np.exp(-t)[:, None] * np.ones(7)
-    plot = figures._steps_plot(ARM, q, q[:1000])
-    assert plot.panels[0].title.startswith("ours")
-    assert {"J7 wrist_roll", "target"} <= {mark.name for mark in plot.panels[0].marks}
 
 
 def linear_drifts(name, size):

@@ -155,18 +155,11 @@ def test_other_commands_read_the_recording(tmp_path, capsys, monkeypatch):
             "durations=2",
             'psm: key "durations" is unknown; did you mean "duration"? allowed in a scenario: arm, closure',
         ),
-        ("controller.kp=2", 'controller: key "kp" is unknown; allowed in controller: mode, release_time'),
-        ("targets=[{tim: 1}]", 'targets[0]: key "tim" is unknown; did you mean "time"? allowed in targets: time, pose'),
         ("duration=long", 'psm: duration is "long"; allowed: a number'),
-        ("controller.parameter_error=abc", 'psm: controller.parameter_error is "abc"; allowed: a number'),
-        ("controler.mode=hold", 'key "controler" is unknown; did you mean "controller"? allowed in a scenario'),
         ("simulated_effects=all", 'psm: simulated_effects is "all"; allowed: a list of strings, e.g. [all]'),
         ("simulated_effects=[al]", "unknown effect al; allowed: all, friction"),
         ("targets=3", "targets is 3; allowed: a list of mappings with the keys time, pose"),
-        ("seed=1.5", "seed is 1.5; allowed: an integer"),
         ("controller.gains.kp=[1, a]", 'controller.gains.kp[1] is "a"; allowed: a number'),
-        ("duration=", "duration is empty; allowed: a number"),
-        ("duration.x=1", "duration is {'x': 1}; allowed: a number"),
         ("duration=.nan", "duration is nan; allowed: a finite number"),
         ("time_step=0.1", "time_step is 0.1; allowed: 1e-05..0.01"),
         ("closure=weld", 'closure is "weld"; allowed: mimic, ball'),
@@ -187,7 +180,6 @@ def test_other_commands_read_the_recording(tmp_path, capsys, monkeypatch):
         ),
         (f"targets=[{{time: .nan, pose: {ZERO}}}]", "targets[0].time is nan; allowed: a finite number"),
         ("effects=[{coordinate: elbow, kind: offset}]", 'effects[0].coordinate is "elbow"; allowed: actuator.yaw'),
-        ("effects=[{coordinate: joint.yaw, kind: viscous}]", 'effects[0].kind is "viscous"; allowed: offset, spring'),
         ("seed=-1", "seed is -1"),
         ("arm=psm9", 'unknown arm "psm9"; did you mean "psm"? known arms: ecm, ecm_si, mtml, mtmr, psm, psm_si'),
         ("duration", "--set duration: a setting must be key=value"),
@@ -221,13 +213,6 @@ def test_simulates_arm_from_file(tmp_path):
     scenario = load_scenario(str(path), ["duration=0.02"])
     assert scenario.mounted_arm.name == "OURS"
     assert main(["simulate", "--arm", str(path), "--set", "duration=0.02"]) == 0
-
-
-def test_error_names_unknown_instrument(tmp_path):
-    arm, scenario = tmp_path / "psm9.yaml", tmp_path / "scenario.yaml"
-    arm.write_text("name: PSM9\nmechanism: psm\ninstrument: scissors\nposition_limits: {}\n")
-    scenario.write_text(f"arm: {arm}\n")
-    assert main(["simulate", str(scenario)]) == 2
 
 
 def test_targets_require_mode_hold():

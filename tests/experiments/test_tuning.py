@@ -160,14 +160,6 @@ def test_pole_placement_gives_desired_damping(ratio, ticks, viscous):
     assert polynomial[1] / (2 * w) == pytest.approx(ratio, rel=0.04)
 
 
-def test_pole_placement_without_lags_is_inaccurate():
-    # The previous test can fail: the gains kp = M w^2, kd = 2 z M w, which ignore the lags, exceed its tolerance.
-    sampling, M, z = Sampling(ticks=3), 0.2, 0.8
-    slowest = poles(SampledLoop(M, sampling), single(M * FAR_BELOW**2, 2 * z * M * FAR_BELOW), sampling)
-    polynomial = np.real(np.poly(slowest[np.abs(slowest) > 1e-6][:2]))
-    assert abs(polynomial[1] / (2 * np.sqrt(polynomial[2])) / z - 1) > 0.08
-
-
 def test_margins_match_stability_limits():
     sampling, M = Sampling(), 0.1
     kp, kd = place(M, 40.0, 0.8, sampling)

@@ -261,18 +261,6 @@ def test_joint_without_feedforward_gets_no_torque():
     assert np.all(actual == 0.0) and np.abs(controller_torque(file, q)[:, 4]).max() > 0.01
 
 
-def test_torque_at_the_last_joint_is_printed_but_accepted(tmp_path, capsys):
-    model = balanced()
-    model.effects = [DriveEffect("joint.wrist_roll", "offset", 0.0, 0.01)]
-    given, out = tmp_path / "model.yaml", tmp_path / "gc.json"
-    model.save(given)
-    arguments = ["export", "--model", str(given), "--dvrk-gc", str(out)]
-    assert main(arguments) == 0
-    assert "(wrist_roll, 0.01 N m)" in " ".join(capsys.readouterr().out.split())
-    assert main([*arguments, "--overwrite", "--gc-tolerance", "0.009"]) == 2
-    assert "wrist_roll 0.01 N m" in refusal(capsys.readouterr().err)
-
-
 def test_loss_names_each_effect():
     model = balanced()
     model.effects = [

@@ -179,16 +179,6 @@ def test_mounting_pitch_of_the_configuration_is_checked(tmp_path, capsys, monkey
     assert "--configuration requires --dvrk-kinematic-gc" in refusal(capsys.readouterr().err)
 
 
-def test_command_exports_a_psm_and_rejects_an_mtm(tmp_path, capsys):
-    out = tmp_path / "psm.json"
-    assert main(["export", "--arm", "psm", "--dvrk-kinematic-gc", str(out)]) == 0
-    printed = " ".join(capsys.readouterr().out.split())
-    assert "are equal at rest" in printed and out.is_file()
-    assert 'enter "kinematic_gc": "psm.json", "mounting_pitch": 0 in the arm\'s JSON' in printed
-    assert main(["export", "--arm", "mtml", "--dvrk-kinematic-gc", str(tmp_path / "mtml.json")]) == 2
-    assert "is not a PSM" in refusal(capsys.readouterr().err)
-
-
 def test_rejected_export_writes_no_file(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     model = perturbed_psm()
@@ -200,10 +190,3 @@ def test_rejected_export_writes_no_file(tmp_path, monkeypatch, capsys):
     assert os.listdir() == ["model.yaml"]
     assert main([*arguments, "--gc-tolerance", "10"]) == 0
     assert {"model.sdf", "gc.json"} < set(os.listdir())
-
-
-def test_rejects_an_sdf_without_the_links_of_a_psm(monkeypatch):
-    bodies = {0: ("turret_link",), 2: ("back_crank_link",)}
-    monkeypatch.setattr("dvrk_drake.export.dvrk_psm_gravity_compensation._BODIES", bodies)
-    with pytest.raises(ModelError, match="the SDF has no link turret_link"):
-        kinematic_compensation(IdentifiedModel.from_arm(load_arm("psm")))

@@ -214,19 +214,6 @@ def test_an_arm_file_can_refer_to_the_exported_sdf(name, tmp_path, capsys):
     np.testing.assert_allclose(derive_gravity(own).base_values, 1.1 * derive_gravity(arm).base_values, atol=1e-12)
 
 
-def test_rotor_inertia_is_added_to_the_mass_matrix(tmp_path):
-    arm, path = load_arm("mtml"), tmp_path / "arm.sdf"
-    rotors = {"outer_yaw": 0.011, "wrist_platform": 0.003}  # wrist_platform has no rotor in the SDF.
-    write_model(arm, [], path, "a test", rotors)
-    exported = dataclasses.replace(arm, sdf=(str(path),))
-    M_before, M_after = (
-        DynamicRegressor(a).mass_matrix(np.zeros((1, 7)), DynamicRegressor(a).values)[0] for a in (arm, exported)
-    )
-    expected = np.zeros((7, 7))
-    expected[0, 0], expected[3, 3] = 0.011 - 1e-6 * 63.41**2, 0.003
-    np.testing.assert_allclose(M_after - M_before, expected, rtol=0, atol=1e-12)
-
-
 def test_rejects_invalid_inertias_and_unknown_links(tmp_path):
     arm, path = load_arm("mtml"), tmp_path / "arm.sdf"
     link = link_inertias(arm)[0]

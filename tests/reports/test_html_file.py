@@ -8,7 +8,6 @@ from pydrake.geometry import Box, MeshcatAnimation
 from pydrake.math import RigidTransform
 from report_checks import check_report, printed_text
 
-from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.reports.colours import LIMIT, MEASURED, SERIES
 from dvrk_drake.reports.html_file import write_html
 from dvrk_drake.reports.page import Command, Page, Plot, Scene, Section, Table, Text, Verdict
@@ -210,9 +209,3 @@ def test_guide_is_drawn_in_all_panels():
     marks = [Guide("y", 0.5, None, LIMIT), Curve("x", [0, 1], [0, 1], MEASURED)]
     plot = Plot("limits", "Limits", [Panel(name, marks) for name in "abc"], columns=2)
     assert len(plotly_figure(plot).layout.shapes) == 3
-
-
-def test_failed_write_leaves_no_file(tmp_path):
-    with pytest.raises((DvrkDrakeError, OSError)):
-        write_html(Page("title", "answer", []), tmp_path / "missing" / "report.html", Provenance.of())
-    assert not list(tmp_path.iterdir())

@@ -77,10 +77,6 @@ def test_sections_are_in_order(case, request):
     assert len({plot.name for plot in blocks(page, Plot)}) == len(blocks(page, Plot))
 
 
-def test_page_states_the_days_of_the_prediction_interval(motion):
-    assert motion.model.interval_scope in repr(identification_page(motion))
-
-
 @pytest.mark.parametrize("case", ["motion", "poses"])
 def test_errors_of_other_models_are_shown_beside_the_new_ones(case, request):
     result = request.getfixturevalue(case)
@@ -229,18 +225,6 @@ def test_bad_path_is_rejected_before_work_begins(command, name, message, tmp_pat
     assert main(words) == 2
     assert message in refusal(capsys.readouterr().err)
     assert (tmp_path / "old.html").read_text() == "old" and not (tmp_path / "new.yaml").exists()
-
-
-def test_command_names_the_report_or_the_option(tmp_path, capsys):
-    model = tmp_path / "model.yaml"
-    dvrk.IdentifiedModel.from_arm(dvrk.load_arm("mtmr")).save(model)
-    words = ["validate", f"{SAMPLES / 'mtm_other_poses.csv'}", "--model", f"{model}"]
-    assert main(words) == 0
-    assert "\n--report FILE.html writes" in capsys.readouterr().out
-    report = tmp_path / "report.html"
-    assert main([*words, "--report", f"{report}"]) == 0
-    assert f"wrote {report}: report" in capsys.readouterr().out.splitlines()
-    assert "dvrk-drake validate" in report.read_text()
 
 
 def test_page_in_a_browser(motion, open_page, tmp_path):

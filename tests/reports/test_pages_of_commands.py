@@ -1,7 +1,6 @@
 """Reports of study, tune, transparency, payload, excite and compare-gc: content; layout of all pages in a browser."""
 
 import hashlib
-import re
 import tempfile
 from dataclasses import replace
 from functools import cache
@@ -11,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_output import refusal
 from figure_rules import checked_figures
 from loaded_arm import two_days
 from report_checks import ALL_VIEWS, check_report
@@ -149,17 +147,6 @@ def test_write_report_selects_the_page_by_type(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
 
 
-def test_result_writes_its_report(tmp_path):
-    recording = tmp_path / "recording.csv"
-    recording.write_text("q1\n0\n")
-    tuning = tuning_result()
-    tuning.report(tmp_path / "method.html", inputs=[recording])
-    dvrk.write_report(tuning, tmp_path / "function.html", inputs=[recording])
-    # Each page states the minute in which it was written.
-    pages = [re.sub(r"[\d: -]+ UTC", "", (tmp_path / f"{name}.html").read_text()) for name in ("method", "function")]
-    assert pages[0] == pages[1] and "recording.csv" in pages[0]
-
-
 def test_all_results_with_a_page_have_the_method():
     def names(kind):
         return {kind.__name__}.union(*map(names, kind.__subclasses__()))
@@ -195,20 +182,3 @@ def test_command_writes_report_with_provenance(gc_file, capsys):
     html = Path("report.html").read_text()
     assert f"dvrk-drake {' '.join(words)}" in html
     assert hashlib.sha256(Path(gc_file).read_bytes()).hexdigest() in html
-
-
-@pytest.mark.parametrize(
-    ("path", "message"),
-    [
-        ("report.pdf", "--report writes HTML; the name of the file must end in .html"),
-        ("old.html", "already exists. Choose another file, or replace it with --overwrite."),
-        ("missing/report.html", "cannot be written: its folder does not exist"),
-    ],
-)
-def test_report_path_is_checked_before_the_work(gc_file, path, message, capsys):
-    Path("old.html").write_text("old")
-    assert main(["export", "compare", gc_file, "--arm", "mtml", "--report", path]) == 2
-    output = capsys.readouterr()
-    assert not output.out and message in refusal(output.err)
-    assert sorted(file.name for file in Path().iterdir()) == [gc_file, "old.html"]
-    assert Path("old.html").read_text() == "old"

@@ -36,9 +36,3 @@ def test_table_fits_and_numbers_are_complete(columns, capsys, monkeypatch):
 def test_narrow_terminal_shows_all_numbers(capsys, monkeypatch):
     text = "\n".join(printed(capsys, monkeypatch, 30))
     assert all(cell in text for cell in CELLS[1:])
-
-
-def test_wide_terminal_keeps_headings_on_one_line(capsys, monkeypatch):
-    title, heading, row, empty = printed(capsys, monkeypatch, 140)
-    assert title.strip() == "Estimates" and row.startswith(NAME) and not empty
-    assert heading.split("  ")[-1].strip() == "saturation [rad/s]"

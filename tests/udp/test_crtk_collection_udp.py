@@ -11,14 +11,12 @@ import sys
 import numpy as np
 import pytest
 from arm_processes import dvrk_drake
-from command_output import refusal
 from dvrk_console import start_console
 from own_network import end, start
 from ros_publisher import DOMAIN_FILE
 from waiting import TIMEOUT, wait_until, within_time_limit
 
 from dvrk_drake.analysis.excitation.pose_file import save_poses
-from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.reading import read_recording
@@ -87,13 +85,6 @@ def files(folder, poses=POSES[:2]):
     """Writes a pose file and returns the options with its path and the path of the output."""
     save_poses(poses, MTML, folder / "p.yaml")
     return [str(folder / "p.yaml"), "--output", str(folder / "p.csv")]
-
-
-def refused(capfd, *options):
-    """Returns the error line of a command that ends with the exit code 2."""
-    capfd.readouterr()
-    assert main(["collect", "poses", "--arm", "mtml", *options]) == 2
-    return refusal(capfd.readouterr().err)
 
 
 def start_collection(folder, *options, poses=POSES):
@@ -207,15 +198,3 @@ def test_dvrk_console_moves_to_the_poses(tmp_path):
     np.testing.assert_allclose(read_recording(tmp_path / "p.csv").q, POSES[:2], atol=1e-4)
     bag = read_recording(tmp_path / "p_1.mcap", MTML)
     assert bag.t[-1] - bag.t[0] > 3.0 and np.all(np.isfinite(bag.q))
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--yes"], "error: --yes: only with --transport ros"),
-        (["--transport", "ros", "--reset"], "error: --reset: only with --transport lcm"),
-        (["--transport", "ros", "--max-effort", "3"], "max_effort is 3; allowed: 0.05..2"),
-    ],
-)
-def test_options_are_checked(tmp_path, capfd, options, message):
-    assert message in refused(capfd, *files(tmp_path), *options)

@@ -98,15 +98,6 @@ def test_drift_plot_shows_models_and_limit(held):
         assert low <= min(map(np.min, curves.values())) and high >= max(map(np.max, curves.values()))
 
 
-def test_demo_page_has_verdict_and_next_step(result, held):
-    folder = result[0]
-    page = demo_page(held, folder)
-    assert page.answer.startswith("Verdict: in mode guide, the identified model holds the released MTML for 4 s.")
-    assert "With the model of the SDF in mode gravity, the largest drift of the same arm is" in page.answer
-    assert page.next_step.startswith(f"dvrk-drake identify {folder}/poses.csv --arm mtml")
-    assert "--report report.html" in page.next_step
-
-
 @pytest.mark.slow
 def test_mean_of_both_approaches_cancels_friction():
     arm = load_arm("mtml")

@@ -52,7 +52,6 @@ def study_refusal(capsys, path, *options):
         ),
         (("scenario: psm", "scenario: psm\nseeds: [1, 1]"), "seeds must not contain a number twice; got [1, 1]"),
         (("scenario: psm", "scenario: psm\nseeds: [-1]"), "seeds[0] is -1; allowed: 0..9223372036854775807"),
-        (("scenario: psm", "scenario: psm\nseeds: [a]"), 'seeds[0] is "a"; allowed: an integer'),
         (("scenario: psm", "scenario: psm\nseeds: []"), "seeds, variations and measures must not be empty"),
         (
             ("scenario: psm", "scenario: psm\nvariations: [{name: a}, {name: a}]"),
@@ -60,14 +59,9 @@ def study_refusal(capsys, path, *options):
         ),
         (("scenario: psm", "scenario: psm\nvariations: [{name: a}, {name: b, set: [arm=mtml]}]"), "the same joints"),
         (("scenario: psm", "scenario: psm\nvariations: [{name: a, set: [length=2]}]"), "length"),
-        (("duration=1", "duration=long"), 'duration is "long"; allowed: a number'),
         (("duration=1", "controller.parameter_error=2"), "controller.parameter_error is 2; allowed: 0..1"),
         (("count: 3", "count: 0"), "random_poses.count is 0; allowed: 1..1000000"),
         (("seed: 1", "margin: 0.5"), "random_poses.margin is 0.5; allowed: 0..0.49"),
-        (
-            ("seed: 1", "sed: 1"),
-            'random_poses: key "sed" is unknown; did you mean "seed"? allowed in random_poses: count, seed',
-        ),
         (("kind: drift", "kind: drif"), 'measures[0].kind is "drif"; allowed: settling_time'),
         (
             ("joints: [pitch]", "joints: [elbow]"),
