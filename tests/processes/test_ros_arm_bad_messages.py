@@ -27,6 +27,7 @@ TOPICS = {
     **dict.fromkeys(JOINT_COMMANDS, m.JointState),
     **{f"jaw/{name}": m.JointState for name in JOINT_COMMANDS},
     "servo_cp": m.PoseStamped,
+    "move_cp": m.PoseStamped,
     "hold": m.Empty,
     "free": m.Empty,
     "use_gravity_compensation": m.Bool,
@@ -214,7 +215,7 @@ def check_arm(sender):
     subject.command("servo_jf", m.JointState(m.Header.now(), effort=effort))
     sender.until(lambda: sender.setpoints[-1].effort == effort, "effort")
     sender.setpoints.clear()
-    names = [*JOINT_COMMANDS, *(f"jaw/{name}" for name in JOINT_COMMANDS), "servo_cp", "state_command"]
+    names = [*JOINT_COMMANDS, *(f"jaw/{name}" for name in JOINT_COMMANDS), "servo_cp", "move_cp", "state_command"]
     sender.send(1000, random.invalid, names)
     sender.send_malformed()
     assert {tuple(message.effort) for message in sender.setpoints} == {tuple(effort)}

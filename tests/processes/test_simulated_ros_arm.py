@@ -35,6 +35,7 @@ COMMANDS = {
     "servo_jf": JointState,
     "move_jp": JointState,
     "servo_cp": PoseStamped,
+    "move_cp": PoseStamped,
     "hold": Empty,
     "free": Empty,
     "use_gravity_compensation": Bool,
@@ -45,6 +46,9 @@ STATES = {
     "measured_cp": PoseStamped,
     "setpoint_cp": PoseStamped,
     "measured_cv": TwistStamped,
+    "local/measured_cp": PoseStamped,
+    "local/setpoint_cp": PoseStamped,
+    "warning": StringStamped,
     "gravity_compensation/setpoint_js": JointState,
 }
 
@@ -124,6 +128,8 @@ def test_client_controls_the_arm(monkeypatch):
     message = client.new("measured_js")
     assert (message.header.nanoseconds, message.name, message.position) == (0, [], []), "not homed: invalid"
     client.send("servo_jf", *[0.0] * 7)
+    client.until(lambda: "warning" in client.last, "warning")
+    assert client.last["warning"].string == "servo_jf refused: the arm is DISABLED; allowed: ENABLED, homed"
     client.home()
     described = [(state.state, state.is_homed, state.is_busy) for state in client.reached]
     assert described == [
@@ -155,6 +161,10 @@ def test_client_controls_the_arm(monkeypatch):
     target.pose.position.z += 0.005
     client.commands["servo_cp"].publish(target)
     client.until(lambda: abs(client.new("setpoint_cp").pose.position.z - target.pose.position.z) < 1e-6, "servo_cp")
+    target.pose.position.z -= 0.005
+    client.commands["move_cp"].publish(target)
+    reached = "local/setpoint_cp"
+    client.until(lambda: abs(client.new(reached).pose.position.z - target.pose.position.z) < 1e-6, "move_cp")
 
     client.send("use_gravity_compensation", True)
     client.until(lambda: np.any(client.new("gravity_compensation/setpoint_js").effort), "gravity compensation")

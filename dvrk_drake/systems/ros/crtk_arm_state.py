@@ -24,6 +24,9 @@ Inverse = Callable[[RigidTransform, NDArray[np.float64]], NDArray[np.float64] | 
 
 _STATE_COMMANDS = ("enable", "disable", "pause", "resume", "home", "unhome")
 #: Mapping from each command of joints to its values, for messages.
+#: Word in each line on a refused command.
+REFUSED = "refused:"
+_POSE_COMMANDS = ("servo_cp", "move_cp")
 _JOINT_COMMANDS = {"servo_jp": "positions", "move_jp": "positions", "servo_jf": "efforts"}
 #: Shortest time between two lines on refused commands [s].
 _QUIET = 2.0
@@ -39,7 +42,8 @@ class CrtkCommand:
 
     Attributes:
         name: Name of the topic in the namespace of the arm, e.g. "servo_jp" or "jaw/servo_jp".
-        values: Positions or efforts [rad, m, N m, N]. `servo_cp`: x, y, z [m], then the quaternion x, y, z, w.
+        values: Positions or efforts [rad, m, N m, N]. `servo_cp` and `move_cp`: x, y, z [m], then the
+            quaternion x, y, z, w.
         velocities: Velocities for `servo_jp` [rad/s, m/s]. Empty: zero.
         text: Text of `state_command`.
         is_on: Value of `use_gravity_compensation`.
@@ -98,7 +102,7 @@ class CrtkArmState:
         Args:
             arm: Arm with limits and joint names. Its `separate_joint` has topics of its own.
             gravity_compensation: Initial state of the gravity compensation.
-            inverse: Inverse kinematics for `servo_cp`. None: `servo_cp` is refused.
+            inverse: Inverse kinematics for `servo_cp` and `move_cp`. None: these commands are refused.
         """
         n = arm.num_joints
         separate = [i for i in range(n) if arm.joint_names[i] == arm.separate_joint]
@@ -127,7 +131,7 @@ class CrtkArmState:
 
     @property
     def is_busy(self) -> bool:
-        """True while the arm moves to the home pose or to the goal of `move_jp`."""
+        """True while the arm moves to the home pose or to the goal of `move_jp` or `move_cp`."""
         return any(group.is_moving for group in self.groups)
 
     @property
@@ -177,7 +181,7 @@ class CrtkArmState:
             group.step(time, q[group.joints])
         for command in commands:
             if refusal := self._receive(command, time):
-                self._report_refusal(f"{command.name[:_MAX_TEXT]} refused: {refusal}", time)
+                self._report_refusal(f"{command.name[:_MAX_TEXT]} {REFUSED} {refusal}", time)
         if self._is_homing and not self.is_busy:
             self._is_homing, self.is_homed, self.is_biased = False, True, True
         if (described := self.describe()) != self._described:
@@ -223,7 +227,7 @@ class CrtkArmState:
         prefix, _, verb = name.rpartition("/")
         group = self._group(prefix)
         if group is None or verb not in _JOINT_COMMANDS:
-            return self._servo_cp(command.values) if name == "servo_cp" else "unknown command"
+            return self._to_pose(name, command.values, time) if name in _POSE_COMMANDS else "unknown command"
         fault = group.fault(command.values, _JOINT_COMMANDS[verb])
         if not fault and len(command.velocities):
             fault = group.fault(command.velocities, "velocities")
@@ -241,7 +245,7 @@ class CrtkArmState:
         """Returns the group of the topics below `prefix`, or None if there is no such group."""
         return self._main if not prefix else self._jaw if prefix == self._jaw_name else None
 
-    def _servo_cp(self, pose: Sequence[float]) -> str:
+    def _to_pose(self, name: str, pose: Sequence[float], time: float) -> str:
         is_plausible = len(pose) == 7 and all(abs(value) < IMPLAUSIBLE for value in pose)
         if not (is_plausible and abs(np.linalg.norm(pose[3:]) - 1.0) < _QUATERNION_TOLERANCE):
             return f"the pose must have finite numbers below {IMPLAUSIBLE:g} and a unit quaternion"
@@ -251,7 +255,10 @@ class CrtkArmState:
         q = None if self._inverse is None else self._inverse(X_BT, self.desired_state[:n])
         if q is None:
             return "the arm cannot reach the pose from the present set-point"
-        self._main.servo_jp(q[self._main.joints])
+        if name == "servo_cp":
+            self._main.servo_jp(q[self._main.joints])
+        else:
+            self._main.move_jp(q[self._main.joints], time)
         return ""
 
     def _change_state(self, command: str, time: float) -> str:

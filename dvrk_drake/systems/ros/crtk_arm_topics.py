@@ -12,7 +12,7 @@ from pydrake.math import RigidTransform
 
 from dvrk_drake.dynamics.kinematics import ArmFrame
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.systems.ros.crtk_arm_state import ArmValues, CrtkArmState, CrtkCommand
+from dvrk_drake.systems.ros.crtk_arm_state import REFUSED, ArmValues, CrtkArmState, CrtkCommand
 from dvrk_drake.systems.ros.domain import RosDomain
 from dvrk_drake.systems.ros.messages import (
     Bool,
@@ -24,6 +24,7 @@ from dvrk_drake.systems.ros.messages import (
     Pose,
     PoseStamped,
     Quaternion,
+    String,
     StringStamped,
     Twist,
     TwistStamped,
@@ -33,6 +34,8 @@ from dvrk_drake.systems.ros.topic import Publisher, Subscription
 
 #: Time between two checks for subscriptions [s].
 _SUBSCRIBERS_PERIOD = 0.1
+#: Topics of lines for the operator.
+_TEXTS = ("info", "warning", "error")
 #: Messages of `state_command` between two ticks, e.g. "enable" and "home". Other topics keep the newest message.
 _STATE_COMMANDS = 10
 
@@ -40,8 +43,9 @@ _STATE_COMMANDS = 10
 class CrtkArmTopics:
     """Publishers and subscriptions of one arm, with the names, types and quality of service of a dVRK.
 
-    A topic without subscriptions is not published, because encoding needs time. `operating_state` is latched and
-    published when it changes.
+    A topic without subscriptions is not published, because encoding needs time. `operating_state` and `state` are
+    latched and published when they change. Lines on refused commands are published on `warning`, those on faults on
+    `error`, and all other lines on `info`.
     """
 
     def __init__(self, arm: Arm, namespace: str, domain: RosDomain, tool: ArmFrame) -> None:
@@ -66,6 +70,8 @@ class CrtkArmTopics:
             "setpoint_js": JointState,
             "measured_cp": PoseStamped,
             "setpoint_cp": PoseStamped,
+            "local/measured_cp": PoseStamped,
+            "local/setpoint_cp": PoseStamped,
             "measured_cv": TwistStamped,
             "gravity_compensation/setpoint_js": JointState,
             **({f"{jaw}/{s}_js": JointState for s in ("measured", "setpoint")} if jaw else {}),
@@ -75,13 +81,18 @@ class CrtkArmTopics:
             name: domain.advertise(f"{namespace}/{name}", message_type) for name, message_type in outputs.items()
         }
         self._operating_state = domain.advertise(f"{namespace}/operating_state", OperatingState, latched=True)
+        self._state = domain.advertise(f"{namespace}/state", StringStamped, latched=True)
+        self._texts = {name: domain.advertise(f"{namespace}/{name}", StringStamped) for name in _TEXTS}
+        if arm.instrument:
+            self._tool_type = domain.advertise(f"{namespace}/tool_type", String, latched=True)
+            self._tool_type.publish(String(arm.instrument))
         self._published_state: tuple[str, bool, bool] | None = None
         joint_commands = ("servo_jp", "servo_jf", "move_jp")
         inputs: dict[str, type] = {
             "state_command": StringStamped,
             "use_gravity_compensation": Bool,
             **dict.fromkeys(joint_commands, JointState),
-            "servo_cp": PoseStamped,
+            **dict.fromkeys(("servo_cp", "move_cp"), PoseStamped),
             "hold": Empty,
             "free": Empty,
             **({f"{jaw}/{command}": JointState for command in joint_commands} if jaw else {}),
@@ -112,6 +123,16 @@ class CrtkArmTopics:
         if state != self._published_state:
             self._published_state = state
             self._operating_state.publish(OperatingState(Header.now(), *state))
+            self._state.publish(StringStamped(Header.now(), machine.state))
+
+    def publish_text(self, line: str) -> None:
+        """Publishes a line of `CrtkArmState.take_lines`.
+
+        Raises:
+            DvrkDrakeError: DDS cannot send the message.
+        """
+        name = "error" if line.startswith("FAULT") else "warning" if REFUSED in line else "info"
+        self._texts[name].publish(StringStamped(Header.now(), line))
 
     def publish(self, values: ArmValues, *, is_valid: bool) -> None:
         """Publishes values with the present time of day.
@@ -135,9 +156,9 @@ class CrtkArmTopics:
             return self._joint_state(header, self._main, values.q, values.v, values.effort)
         if name == "setpoint_js":
             return self._joint_state(header, self._main, values.setpoint_q, values.setpoint_v, values.setpoint_effort)
-        if name == "measured_cp":
+        if name.endswith("measured_cp"):
             return _pose(header, self._tool.pose(values.q))
-        if name == "setpoint_cp":
+        if name.endswith("setpoint_cp"):
             return _pose(header, self._tool.pose(values.setpoint_q))
         if name == "measured_cv":
             V = (self._tool.jacobian(values.q) @ values.v).tolist()

@@ -204,6 +204,13 @@ class Empty(IdlStruct, typename="std_msgs::msg::dds_::Empty_"):
 
 
 @dataclass
+class String(IdlStruct, typename="std_msgs::msg::dds_::String_"):
+    """Text."""
+
+    data: str = ""
+
+
+@dataclass
 class StringStamped(IdlStruct, typename="crtk_msgs::msg::dds_::StringStamped_"):
     """Text with a header."""
 
@@ -228,6 +235,7 @@ _HASHES: dict[type[IdlStruct], str] = {
     TwistStamped: "5f0fcd4f81d5d06ad9b4c4c63e3ea51b82d6ae4d0558f1d475229b1121db6f64",
     Bool: "feb91e995ff9ebd09c0cb3d2aed18b11077585839fb5db80193b62d74528f6c9",
     Empty: "20b625256f32d5dbc0d04fee44f43c41e51c70d3502f84b4a08e7a9c26a96312",
+    String: "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
     StringStamped: "83efb802e6596e03f69ac322e3231037329946f2bd13ed48874d97f5b8f5db1d",
     OperatingState: "5cc57eea589b217fe5194bf2735b91d4a7f2dd5ac1245ae657f7ea7590c2c80e",
 }

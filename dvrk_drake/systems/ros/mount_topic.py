@@ -51,7 +51,7 @@ def _received_gravity(topic: str, domain: RosDomain) -> tuple[float, float, floa
     subscription, messages = domain.subscribe(topic, PoseStamped, reliable=False), list[PoseStamped]()
 
     def receive() -> bool:
-        messages.extend(subscription.take())
+        messages.extend(message for message, _ in subscription.take())
         return bool(messages)
 
     if not domain.wait_until(receive, _FIRST):

@@ -105,6 +105,8 @@ class CrtkArmServer(LeafSystem):
         machine.step(context.get_time(), q, v, commands)
         for line in machine.take_lines():
             self._report(line)
+            if self._topics is not None:
+                self._topics.publish_text(line)
         if self._topics is not None:
             self._topics.publish_state(machine)
 

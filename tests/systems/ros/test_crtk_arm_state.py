@@ -215,7 +215,7 @@ def test_invalid_numbers_change_nothing(name, values):
         np.testing.assert_allclose(bench.effort(0.01, 9.0), 0.01 if mode == "hold" else 0.0, rtol=0, atol=1e-12)
 
 
-def test_servo_cp_uses_the_inverse_kinematics():
+def test_commanded_poses_use_the_inverse_kinematics():
     poses = []
     result = np.full(7, 0.2)
 
@@ -240,6 +240,12 @@ def test_servo_cp_uses_the_inverse_kinematics():
         f"servo_cp refused: {refusal}",
         "servo_cp refused: the arm cannot reach the pose from the present set-point (3 more commands refused before)",
     ]
+    result = np.full(7, 0.1)
+    bench.step(CrtkCommand("move_cp", (0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0)))
+    assert bench.machine.is_busy
+    bench.wait(2.0)
+    assert not bench.machine.is_busy
+    np.testing.assert_allclose(bench.machine.desired_state[:7], [0.1] * 6 + [0.0], rtol=0, atol=1e-12)
 
 
 def test_invalid_measurement_removes_the_power():

@@ -22,6 +22,7 @@ NAMES = {
     messages.TwistStamped: "geometry_msgs/msg/TwistStamped",
     messages.Bool: "std_msgs/msg/Bool",
     messages.Empty: "std_msgs/msg/Empty",
+    messages.String: "std_msgs/msg/String",
     messages.StringStamped: "crtk_msgs/msg/StringStamped",
     messages.OperatingState: "crtk_msgs/msg/OperatingState",
 }
@@ -49,6 +50,7 @@ CONTENTS = {
     messages.TwistStamped: (HEADERS, st.builds(messages.Twist, VECTORS, VECTORS)),
     messages.Bool: (st.booleans(),),
     messages.Empty: (),
+    messages.String: (TEXTS,),
     messages.StringStamped: (HEADERS, TEXTS),
     messages.OperatingState: (HEADERS, TEXTS, st.booleans(), st.booleans()),
 }

@@ -20,7 +20,9 @@ def domain(*messages):
     """Returns a substitute domain whose only topic has these messages."""
     return SimpleNamespace(
         name="ROS domain 5",
-        subscribe=lambda topic, message_type, **options: SimpleNamespace(take=lambda: list(messages)),
+        subscribe=lambda topic, message_type, **options: SimpleNamespace(
+            take=lambda: [(message, 0) for message in messages]
+        ),
         wait_until=lambda condition, seconds: condition(),
     )
 
