@@ -37,12 +37,13 @@ def topic_gravity(topic: str, domain: RosDomain | None = None) -> tuple[float, f
     """
     if fault := topic_fault(topic):
         raise DvrkDrakeError(f"topic {fault}")
-    own = open_ros_domain() if domain is None else None
+    if domain is not None:
+        return _received_gravity(topic, domain)
+    own = open_ros_domain()
     try:
-        return _received_gravity(topic, domain or own)
+        return _received_gravity(topic, own)
     finally:
-        if own is not None:
-            own.close()
+        own.close()
 
 
 def _received_gravity(topic: str, domain: RosDomain) -> tuple[float, float, float]:
