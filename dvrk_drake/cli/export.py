@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -49,7 +48,6 @@ def export_model(
     dvrk_kinematic_gc: Annotated[str | None, Parameter(metavar="FILE.json")] = None,
     configuration: Annotated[str | None, Parameter(metavar="ARM.json")] = None,
     meshes: Literal["gltf", "obj"] = "gltf",
-    diff: Annotated[bool, Parameter(show_default=False)] = False,
     overwrite: Overwrite = False,
     verbose: Verbose = False,
     gc_tolerance: Annotated[float | None, Parameter(metavar="NM", group=_GRAVITY_COMPENSATION)] = None,
@@ -72,7 +70,6 @@ def export_model(
         configuration: Configuration of the PSM in the dVRK, whose mounting_pitch is checked. Default: the JSON file
             beside --dvrk-kinematic-gc that names this file under kinematic_gc.
         meshes: Format of the meshes of the SDF and URDF. PyBullet and MuJoCo require obj.
-        diff: Print the differences between the SDF of the arm and the exported SDF.
         gc_tolerance: Largest accepted torque difference between the file and the model [N m; N]. Default: the dry
             friction of each joint, which holds a joint at rest despite such a difference.
         friction: Also compensate the dry friction of the model. The model must be identified from a motion. SDF and
@@ -82,9 +79,8 @@ def export_model(
         dead_band: Speed below which no friction is compensated [rad/s]. Default: 0.02 0.02 0.02 0.01 0.008 0.008 0.01.
         saturation: Speed above which the full --friction-ratio applies [rad/s]. Default: 0.4 0.2 0.2 0.4 0.4 0.2 0.4.
     """
-    from dvrk_drake.dynamics.model_links import model_bodies
     from dvrk_drake.export.model_export import MODEL_FORMATS, configuration_beside, prepare_export
-    from dvrk_drake.export.model_writer import mesh_folder, refuse_existing_meshes, sdf_difference
+    from dvrk_drake.export.model_writer import mesh_folder, refuse_existing_meshes
     from dvrk_drake.reports.export import export_page
 
     requested: dict[Format, str | None] = {
@@ -95,8 +91,8 @@ def export_model(
         "dvrk-kinematic-gc": dvrk_kinematic_gc,
     }
     outputs = {format: path for format, path in requested.items() if path is not None}
-    if not outputs and not diff:
-        raise DvrkDrakeError(f"no output is given; use {', '.join('--' + format for format in requested)} or --diff")
+    if not outputs:
+        raise DvrkDrakeError(f"no output is given; use {', '.join('--' + format for format in requested)}")
     if friction and coulomb is not None:
         raise DvrkDrakeError("--friction and --coulomb exclude each other; give one of them")
     if configuration is not None and dvrk_kinematic_gc is None:
@@ -135,10 +131,6 @@ def export_model(
         what = f"the base of the recorded arm seems to be tilted, but the model assumes that it is not ({tilt})"
         advice = "Identify again with --gravity before you use an exported file."
         print_warning(f"{origin}: {what}. {advice}")
-    if diff:
-        loaded.arm.refuse_locked_joints("--diff")
-        bodies = model_bodies(loaded)
-        sys.stdout.write(sdf_difference(loaded.arm, bodies.links, bodies.rotors))
 
 
 @export.command(name="compare")

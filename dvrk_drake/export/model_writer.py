@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 import re
 import shutil
@@ -153,14 +152,6 @@ def _add_friction(root: ElementTree.Element, drives: Sequence[Drive]) -> None:
         damping = ElementTree.SubElement(dynamics, "damping") if damping is None else damping
         damping.text = repr(float(damping.text or 0.0) + drive.viscous)
         ElementTree.SubElement(dynamics, "friction").text = repr(drive.dry)
-
-
-def sdf_difference(arm: Arm, links: Sequence[LinkInertia], rotor_inertias: Mapping[str, float] | None = None) -> str:
-    """Returns the unified diff between the SDF of the arm and that of `with_inertias`, or "" if nothing changes."""
-    before, after = (
-        to_text(root).splitlines(keepends=True) for root in (arm_sdf(arm), with_inertias(arm, links, rotor_inertias))
-    )
-    return "".join(difflib.unified_diff(before, after, " + ".join(arm.sdf), "exported", n=4))
 
 
 def to_text(root: ElementTree.Element, comment: str = "") -> str:

@@ -10,8 +10,9 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.sdf_elements import DRAKE
 
-#: Speed limit of joints for which the SDF has no speed limit [rad/s, m/s]. URDF requires a speed limit.
-NO_SPEED_LIMIT = "1000"
+#: Speed limit of joints for which the SDF has no speed limit [rad/s, m/s]. URDF requires a speed limit. It is the
+#: largest one of an arm of this package, so that a URDF can be used as an arm.
+NO_SPEED_LIMIT = "100"
 #: Inertia of a link without `<inertial>`, which only the fixed base may be: a sphere of 1 kg with a radius of 0.1 m.
 #: libsdformat removes a link without mass from a URDF, and all links that it carries.
 _BASE_MASS, _BASE_MOMENT = "1", "0.004"

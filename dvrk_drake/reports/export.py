@@ -66,7 +66,8 @@ def _bodies_page(path: str, export: ModelExport, bodies: ModelBodies) -> Page:
     if export.drives is not None:
         blocks.append(_drive_table(export.model.arm, export.drives))
         blocks.append(Text("Not exported: presliding friction, i.e. the elastic travel before a joint slides"))
-    command = f"dvrk-drake export {_source(export.model, export.origin)} --diff"
+    # A file with friction cannot be used as an arm.
+    command = f"dvrk-drake view --arm {path}" if export.drives is None else ""
     return Page(f"Exported model {path}", answer, [Section("Links", blocks)], "good", command)
 
 
