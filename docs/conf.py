@@ -45,6 +45,8 @@ nb_execution_timeout = 600
 nb_execution_raise_on_error = True
 nb_execution_in_temp = True
 nb_merge_streams = True
+# Pygments cannot parse a command of several lines in an IPython cell. It is shown nevertheless.
+suppress_warnings = ["misc.highlighting_failure"]
 # The site loads nothing from the network.
 nb_ipywidgets_js: dict[str, dict[str, str]] = {}
 
