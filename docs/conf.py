@@ -88,4 +88,5 @@ def split_attributes(_app: Sphinx, _what: str, _name: str, _obj: object, _option
 def setup(app: Sphinx) -> None:
     """Registers the handler, which runs before that of Napoleon (priority 500)."""
     TypeAliasForwardRef.__getitem__ = array_alias
+    TypeAliasForwardRef.__repr__ = lambda alias: alias.name  # for unions
     app.connect("autodoc-process-docstring", split_attributes, priority=400)
