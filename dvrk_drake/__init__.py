@@ -48,13 +48,14 @@ if TYPE_CHECKING:
     from dvrk_drake.systems.arm_view.page import start_meshcat
     from dvrk_drake.systems.closed_loop import add_closed_loop
     from dvrk_drake.systems.external_force_estimator import ExternalForceEstimator
+    from dvrk_drake.systems.force_feedback import ForceFeedback
     from dvrk_drake.systems.gravity_pid_controller import GravityPidController
     from dvrk_drake.systems.hardware_arm_station import HardwareArmStation
     from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
     from dvrk_drake.systems.ros.crtk_driver import CrtkDriver
     from dvrk_drake.systems.station import Station
     from dvrk_drake.systems.station_config import load_station_config
-    from dvrk_drake.systems.teleoperated_arms import TeleoperatedArms
+    from dvrk_drake.systems.teleoperated_arms import TeleoperatedArms, Wall
 
 #: Mapping from a public name to the module that defines it.
 _MODULES = {
@@ -69,6 +70,7 @@ _MODULES = {
     "DvrkDriver": "systems.lcm.dvrk_driver",
     "Environment": "models.environment",
     "ExternalForceEstimator": "systems.external_force_estimator",
+    "ForceFeedback": "systems.force_feedback",
     "GravityPidController": "systems.gravity_pid_controller",
     "HardwareArmStation": "systems.hardware_arm_station",
     "IdentifiedModel": "dynamics.identified_model",
@@ -79,6 +81,7 @@ _MODULES = {
     "Scenario": "experiments.scenario",
     "Station": "systems.station",
     "TeleoperatedArms": "systems.teleoperated_arms",
+    "Wall": "systems.teleoperated_arms",
     "add_arm": "models.plant",
     "add_arm_drive": "systems.arm_drive",
     "add_closed_loop": "systems.closed_loop",
@@ -122,6 +125,7 @@ __all__ = [
     "DvrkDriver",
     "Environment",
     "ExternalForceEstimator",
+    "ForceFeedback",
     "GravityPidController",
     "HardwareArmStation",
     "IdentifiedModel",
@@ -132,6 +136,7 @@ __all__ = [
     "Scenario",
     "Station",
     "TeleoperatedArms",
+    "Wall",
     "add_arm",
     "add_arm_drive",
     "add_closed_loop",

@@ -236,6 +236,15 @@ Realtime = Annotated[
     Parameter(show_default=False, help="Request real-time scheduling. Print a warning if it is not permitted."),
 ]
 
+PublishForce = Annotated[
+    bool,
+    Parameter(
+        show_default=False,
+        help="Publish the external force at the tip with its covariance (docs/external_force.md). It requires a "
+        "--model that was identified from a motion.",
+    ),
+]
+
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)

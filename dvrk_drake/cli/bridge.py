@@ -8,7 +8,19 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from dvrk_drake.cli.app import Arm, Gravity, Instrument, Key, LcmUrl, Model, Realtime, RosDomain, RosTopic, bridge
+from dvrk_drake.cli.app import (
+    Arm,
+    Gravity,
+    Instrument,
+    Key,
+    LcmUrl,
+    Model,
+    PublishForce,
+    Realtime,
+    RosDomain,
+    RosTopic,
+    bridge,
+)
 from dvrk_drake.cli.support import driver_configuration, interrupt_ends_process, mounted, print_line, request_realtime
 from dvrk_drake.errors import ControllerError
 
@@ -29,6 +41,7 @@ def bridge_arm(
     gravity: Gravity = None,
     realtime: Realtime = False,
     poll: Annotated[bool, Parameter(negative="")] = False,
+    publish_force: PublishForce = False,
 ) -> None:
     """Connect a dVRK arm on ROS 2 to LCM, behind a command guard.
 
@@ -69,6 +82,7 @@ def bridge_arm(
         topic=topic,
         domain=domain,
         polls=poll,
+        publish_force=publish_force,
         stopped=stopped,
         report=print_line,
         ready=ready,

@@ -241,5 +241,5 @@ def _connect(
                 time.sleep(0.02)
 
     dialog = Dialog(confirm=confirm, enter=enter, report=line.report, show=line.show)
-    connection = connect_arm(controlled, dialog, stop_on_contact)
+    connection = connect_arm(controlled, dialog, stop_on_contact=stop_on_contact)
     return connection, line

@@ -5,11 +5,11 @@ from __future__ import annotations
 import sys
 from contextlib import closing, suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from dvrk_drake.cli.app import HARDWARE, ConnectedArm, ControlledArm, app
+from dvrk_drake.cli.app import HARDWARE, ConnectedArm, ControlledArm, PublishForce, app
 from dvrk_drake.cli.support import (
     interrupt_ends_process,
     print_line,
@@ -55,6 +55,7 @@ def control(
     friction_ratio: Annotated[float, Parameter(metavar="R")] = 0.0,
     hysteresis_ratio: Annotated[float, Parameter(metavar="R")] = 0.0,
     friction_model: Annotated[str | None, Parameter(metavar="MODEL.yaml")] = None,
+    publish_force: PublishForce = False,
 ) -> None:
     """Control an arm: compensate gravity, damp it, guide it or hold a pose.
 
@@ -75,7 +76,7 @@ def control(
     with interrupt_ends_process():
         compensator = _friction_compensator(controlled, mode, friction_ratio, hysteresis_ratio, friction_model)
         checked_gains = None if gains is None else _gains(gains, mode, controlled.arm)
-        connection = connect_arm(controlled, Dialog(report=print_line))
+        connection = connect_arm(controlled, Dialog(report=print_line), publish_force=publish_force)
     if mode == "guide" and not is_cross_validated(connection.model):
         print_warning(
             "the error of the model is unknown, because it was not identified from a recording; virtual friction holds "
@@ -210,8 +211,8 @@ def _friction_compensator(
     return compensator
 
 
-def connect_arm(controlled: ControlledArm, dialog: Dialog, stop_on_contact: float | None = None) -> ArmConnection:
-    """Returns the connection to the arm that the options of a command define. See `dvrk_drake.connect`.
+def connect_arm(controlled: ControlledArm, dialog: Dialog, **settings: Any) -> ArmConnection:
+    """Returns the connection to the arm that the options of a command define. See `dvrk_drake.connect` for `settings`.
 
     Use the connection within `interrupt_ends_process`. Ctrl-C then ends the process at once, until this process
     commands the arm. From then on, `dialog.stopped` returns true after Ctrl-C.
@@ -235,4 +236,4 @@ def connect_arm(controlled: ControlledArm, dialog: Dialog, stop_on_contact: floa
         if warning := model_warning(controlled.model, model):
             print_warning(warning)
     dialog = replace(dialog, stopped=lambda: any(handler() for handler in handlers))
-    return controlled.connect(dialog, model=model, reset=controlled.reset, ready=ready, stop_on_contact=stop_on_contact)
+    return controlled.connect(dialog, model=model, reset=controlled.reset, ready=ready, **settings)

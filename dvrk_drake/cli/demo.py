@@ -51,6 +51,7 @@ def demo(
 def teleop(
     *,
     output: Annotated[str | None, Parameter(metavar="FILE.html")] = None,
+    force_feedback: Annotated[bool, Parameter(show_default=False)] = False,
     overwrite: Overwrite = False,
     port: Port = None,
     verbose: Verbose = False,
@@ -61,11 +62,13 @@ def teleop(
 
     Args:
         output: Play a recorded hand motion, write an animation to this HTML file, and print the PSM's tracking error.
+        force_feedback: Place an object below the instrument, and reflect the estimated force of the contact to the MTM.
     """
     from dvrk_drake.experiments.demo.teleoperation import PHASES, play_teleoperation, run_live_teleoperation
     from dvrk_drake.experiments.demo.teleoperation_scene import start_scene
     from dvrk_drake.models.files import atomic_write
     from dvrk_drake.reports.demo import teleoperation_page
+    from dvrk_drake.systems.arm_view.force_arrow import FORCE_COLOR, FORCE_SCALE
     from dvrk_drake.systems.arm_view.page import page_html
 
     if output is None:
@@ -75,14 +78,16 @@ def teleop(
             "the arms appear after some seconds; press Stop, Escape or Ctrl-C to end",
             flush=True,
         )
-        run_live_teleoperation(meshcat)
+        run_live_teleoperation(meshcat, force_feedback=force_feedback)
         return
     check_output(output, overwrite=overwrite)
     meshcat = start_scene(port)
     with Steps("playing") as steps:
-        result = play_teleoperation(meshcat, progress=step_progress(steps, "playing"))
+        progress = step_progress(steps, "playing")
+        result = play_teleoperation(meshcat, progress=progress, force_feedback=force_feedback)
     with atomic_write(output) as stream:
-        stream.write(page_html(meshcat, "MTML teleoperates PSM", phases=PHASES, effort_scale=True))
+        colors = {FORCE_COLOR: FORCE_SCALE} if force_feedback else {}
+        stream.write(page_html(meshcat, "MTML teleoperates PSM", phases=PHASES, colors=colors, effort_scale=True))
     show_page(teleoperation_page(result, output), verbose=verbose)
     print_written(output)
 

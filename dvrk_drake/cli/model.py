@@ -103,10 +103,11 @@ def view(
     the camera. Sliders from 0 to 1 show frames and gravity efforts, and select degrees.
 
     Args:
-        live: Show the measured pose and efforts from the LCM messages of the arm, and the commanded pose as a ghost.
+        live: Show the measured pose and efforts from the LCM messages of the arm, the commanded pose as a ghost, and
+            the external force if it is published (--publish-force of control and bridge).
     """
     from dvrk_drake.models.arm_files import load_arm
-    from dvrk_drake.processes.live_view import show_status
+    from dvrk_drake.processes.live_view import LiveForce, show_status
     from dvrk_drake.systems.arm_view.arm_view import ArmView
     from dvrk_drake.systems.arm_view.page import start_meshcat
     from dvrk_drake.systems.lcm.arm_link import LcmArmLink
@@ -121,9 +122,9 @@ def view(
     arm_view.add_view_buttons()
     ending = "press Stop, Escape or Ctrl-C to end"
     if live:
-        link = LcmArmLink(shown, url, replays=True)
+        link, force = LcmArmLink(shown, url, replays=True), LiveForce(shown, url)
         print(f"{shown.name} live at {meshcat.web_url()}; {ending}", flush=True)
-        until_stopped(meshcat, lambda: show_status(arm_view, link))
+        until_stopped(meshcat, lambda: show_status(arm_view, link, force))
         return
     arm_view.add_sliders()
     print(f"{shown.name} at {meshcat.web_url()}; the controls are under Open Controls; {ending}", flush=True)

@@ -93,12 +93,15 @@ class Contact:
         """Returns the position p_BP (3,) of the point [m] at a pose q (n,)."""
         return np.asarray(self._frame.pose(q) @ self._p_FP)
 
+    def directions(self, q: ArrayLike) -> NDArray[np.float64]:
+        """Returns the directions (3, k) of the components at a pose q (n,), in the base frame, as unit vectors."""
+        rotation = self._frame.pose(q).rotation().matrix() if self.axes == "frame" else np.eye(3)
+        return np.asarray(rotation @ self._select.T)
+
     def jacobian(self, q: ArrayLike) -> NDArray[np.float64]:
         """Returns the matrix J at a pose q (n,). An additional row belongs to the force of the cannula."""
-        J = self._frame.jacobian(q)
-        rotation = self._frame.pose(q).rotation().matrix()
-        of_point = J[3:] + np.cross(J[:3], rotation @ self._p_FP, axis=0)
-        rows = self._select @ (rotation.T @ of_point if self.axes == "frame" else of_point)
+        J, X_BF = self._frame.jacobian(q), self._frame.pose(q)
+        rows = self.directions(q).T @ (J[3:] + np.cross(J[:3], X_BF.rotation() @ self._p_FP, axis=0))
         if self._shaft is None:
             return rows
         X_BS, J_S = self._shaft.pose(q), self._shaft.jacobian(q)

@@ -5,4 +5,5 @@ lcm-gen 1.5.3
 """
 
 from .lcmt_dvrk_command import lcmt_dvrk_command as lcmt_dvrk_command
+from .lcmt_dvrk_force import lcmt_dvrk_force as lcmt_dvrk_force
 from .lcmt_dvrk_status import lcmt_dvrk_status as lcmt_dvrk_status

@@ -1,7 +1,7 @@
 """Channels, authentication and decoding of the LCM messages of an arm.
 
 A status is a message lcmt_dvrk_status, which the arm's process sends. A command is a message lcmt_dvrk_command, which a
-controller sends.
+controller sends. An estimated force is a message lcmt_dvrk_force, which a controller or a bridge sends.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from dvrk_drake.errors import KeyFileError
-from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
+from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_force, lcmt_dvrk_status
 from dvrk_drake.models.files import open_input
 
 if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm
 
-#: Version of both message types. The first 8 bytes of a message, its fingerprint, depend on all fields of its type. A
+#: Version of all message types. The first 8 bytes of a message, its fingerprint, depend on all fields of its type. A
 #: changed field therefore makes a new version. Receivers ignore messages of other versions (docs/files.md).
 MESSAGE_VERSION = "1.0"
 #: Minimum and maximum length of a key, and length of a new key [bytes]. The maximum is that of BLAKE2b.
@@ -107,7 +107,7 @@ def create_key_file(path: str | Path) -> None:
         file.write(secrets.token_bytes(_NEW_LENGTH))
 
 
-Message = TypeVar("Message", lcmt_dvrk_command, lcmt_dvrk_status)
+Message = TypeVar("Message", lcmt_dvrk_command, lcmt_dvrk_force, lcmt_dvrk_status)
 
 STATUS_PREFIX = "DVRK_STATUS_"
 
@@ -155,6 +155,11 @@ def command_channel(arm: Arm) -> str:
 def status_channel(arm: Arm) -> str:
     """Returns the status channel of an arm, DVRK_STATUS_<ARM>."""
     return STATUS_PREFIX + arm.name.upper()
+
+
+def force_channel(arm: Arm) -> str:
+    """Returns the channel of the estimated external force on an arm, DVRK_FORCE_<ARM>."""
+    return f"DVRK_FORCE_{arm.name.upper()}"
 
 
 def decode(message_type: type[Message], data: bytes) -> Message | None:

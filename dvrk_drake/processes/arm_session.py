@@ -21,8 +21,8 @@ from dvrk_drake.models.environment import Environment
 from dvrk_drake.models.lcm_messages import MessageKey
 from dvrk_drake.processes.arm_controller import ArmController, GoalController
 from dvrk_drake.processes.arm_operator import reset_fault
-from dvrk_drake.processes.contact_stop import ContactStop
 from dvrk_drake.processes.control import FIRST_WAIT, SILENCE, StatusHandler, control, first_status
+from dvrk_drake.processes.force_monitor import ForceMonitor
 from dvrk_drake.processes.live_status import LiveStatus
 from dvrk_drake.systems.friction_compensator import FrictionCompensator
 from dvrk_drake.systems.gravity_pid_controller import Mode
@@ -76,7 +76,8 @@ class ArmSession:
         model: Model for the control of the arm.
         transport: "lcm" or "ros".
         dialog: Functions for the communication with the operator.
-        lcm_url, key, topic, domain, reset, guard, ready, stop_on_contact: See `connect`.
+        lcm_url, key, topic, domain, reset, guard, ready, stop_on_contact, publish_force: See
+            `connect`.
         options: Options of a command line for this arm, for messages.
     """
 
@@ -92,6 +93,7 @@ class ArmSession:
     guard: GuardSettings = field(default_factory=GuardSettings)
     ready: Callable[[], None] = field(default=lambda: None)
     stop_on_contact: float | None = None
+    publish_force: bool = False
     options: str = ""
 
     def __post_init__(self) -> None:
@@ -169,7 +171,7 @@ class ArmSession:
 
         Raises:
             ControllerError: See `dvrk_drake.processes.control.control`, or something touches the arm.
-            ModelError: The contact cannot be detected with this model, see `ContactStop`.
+            ModelError: The force cannot be estimated with this model, see `ForceMonitor`.
         """
 
         def show(status: LiveStatus) -> None:
@@ -179,8 +181,14 @@ class ArmSession:
 
         with closing(link):
             handler = on_status
-            if self.stop_on_contact is not None:
-                handler = ContactStop(self.model, self.stop_on_contact, on_status)
+            if self.stop_on_contact is not None or self.publish_force:
+                send = link.send_force if self.publish_force else None
+                monitor = ForceMonitor(self.model, send=send, stop_on_contact=self.stop_on_contact)
+
+                def handler(status: lcmt_dvrk_status, time: float) -> NDArray[np.float64] | None:
+                    monitor.update(status)
+                    return on_status(status, time)
+
             control(link, controller, stopped, show, handler)
 
     def check_path(

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import select
 from collections.abc import Callable
 
 import lcm
 
+from dvrk_drake.errors import ModelError
+from dvrk_drake.lcmtypes import lcmt_dvrk_force
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.lcm_messages import command_channel, status_channel
+from dvrk_drake.models.lcm_messages import command_channel, force_channel, status_channel
+from dvrk_drake.processes.force_monitor import ForceMonitor
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.lcm_network import handle_message
 from dvrk_drake.systems.ros.open_domain import require_cyclonedds
@@ -31,6 +35,7 @@ def run_bridge(
     topic: str | None,
     domain: int | None,
     polls: bool = False,
+    publish_force: bool = False,
     stopped: Callable[[], bool],
     report: Callable[[str], None],
     ready: Callable[[], None] = lambda: None,
@@ -46,6 +51,7 @@ def run_bridge(
         domain: ROS domain. None: the environment variable ROS_DOMAIN_ID, or else 0.
         polls: Whether to poll for messages while a controller commands the arm. The delay decreases, but the bridge
             uses a processor core.
+        publish_force: Whether to publish the external force, estimated with the model of the driver, on both networks.
         stopped: Function that returns whether to stop.
         report: Function that is called with one line for each change of the state.
         ready: Function that is called before the networks are opened, e.g. to request real-time scheduling.
@@ -56,6 +62,7 @@ def run_bridge(
         Whether the arm has confirmed the last command, `hold`.
 
     Raises:
+        ModelError: The force cannot be estimated with the model of the driver.
         DvrkDrakeError: The arm is not found, its topics do not fit, or another process could move it.
     """
     require_cyclonedds()
@@ -75,6 +82,17 @@ def run_bridge(
                 problem = f"LCM {url}: the status could not be sent: {error.strerror}"
                 report(problem)
 
+    def send_force(force: lcmt_dvrk_force) -> None:
+        data = force.encode()
+        with contextlib.suppress(OSError):  # reported for the status
+            network.publish(force_channel(arm), data if key is None else key.sign(data))
+        bridge.send_force(force)
+
+    monitor, key = None, driver.load_key()
+    if publish_force:
+        if (model := driver.load_model(arm)) is None:
+            raise ModelError("the estimated force requires a model of the arm that was identified from a motion")
+        monitor = ForceMonitor(model, send=send_force)
     bridge = connect_bridge(
         arm, driver, send_status, topic=topic, domain=domain, report=report, stopped=stopped, polled=polls
     )
@@ -90,6 +108,8 @@ def run_bridge(
             if enter():
                 bridge.guard.allow_reset()
             is_answer = bridge.update()
+            if monitor is not None:
+                monitor.update(bridge.status)
             if polls:
                 timeout = 0.0 if bridge.is_commanded and not is_answer else _PAUSE
     finally:

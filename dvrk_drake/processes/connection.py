@@ -18,7 +18,7 @@ from dvrk_drake.models.lcm_messages import MessageKey, describe_state
 from dvrk_drake.processes.arm_operator import ArmObservation, observe, stop_arm
 from dvrk_drake.processes.arm_session import ArmSession, Dialog
 from dvrk_drake.processes.collector import CollectionSettings, Collector, collect_poses
-from dvrk_drake.processes.contact_stop import ContactStop
+from dvrk_drake.processes.force_monitor import ForceMonitor
 from dvrk_drake.processes.live_status import LiveStatus
 from dvrk_drake.processes.motion_player import PlayedMotion, play_motion
 from dvrk_drake.processes.recorder import ArmRecorder, LcmRecorder
@@ -247,6 +247,7 @@ def connect(
     dialog: Dialog | None = None,
     ready: Callable[[], None] = lambda: None,
     stop_on_contact: float | None = None,
+    publish_force: bool = False,
 ) -> ArmConnection:
     """Returns a connection to an arm, whose methods measure, move and control the arm.
 
@@ -270,9 +271,12 @@ def connect(
         stop_on_contact: Expected number of false alarms per hour with which this process detects a contact, ends the
             control and lets the arm hold its pose. It requires a model that was identified from a motion. None:
             contacts are not detected.
+        publish_force: Whether this process publishes the estimated force at the frame `arm.frames.hand` while it
+            controls the arm. It requires a model that was identified from a motion.
 
     Raises:
-        ModelError: The model cannot be read, belongs to another arm, or is not suitable for `stop_on_contact`.
+        ModelError: The model cannot be read, belongs to another arm, or is not suitable for `stop_on_contact` or
+            `publish_force`.
         KeyFileError: The key cannot be used.
         ControllerError: The transport is not known, or the rate of false alarms is out of range.
 
@@ -297,9 +301,9 @@ def connect(
     connection = ArmConnection(
         arm, used, transport, dialog, lcm_url, loaded, topic, domain, reset, guard or GuardSettings(), ready
     )
-    if stop_on_contact is not None:
-        ContactStop(used, stop_on_contact)  # raises an error if the model is not suitable
-        connection.stop_on_contact = stop_on_contact
+    if stop_on_contact is not None or publish_force:
+        ForceMonitor(used, stop_on_contact=stop_on_contact)  # raises an error if the model is not suitable
+        connection.stop_on_contact, connection.publish_force = stop_on_contact, publish_force
     return connection
 
 

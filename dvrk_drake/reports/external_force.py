@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.external_force import ExternalForce
+from dvrk_drake.dynamics.contact import is_measurable
 from dvrk_drake.models.effects_schema import half_width
 from dvrk_drake.reports.colours import FITTED, HELD_OUT, NEUTRAL
-from dvrk_drake.reports.page import Page, Plot, Section, Table, Text
+from dvrk_drake.reports.page import Block, Page, Plot, Scene, Section, Table, Text
 from dvrk_drake.reports.plot import Band, Curve, Guide, Mark, Panel, decimated, effort_unit, joint_label
 
 #: Largest number of plotted rows. Each curve has about this number of points, twice the pixels of a wide page.
@@ -24,7 +25,7 @@ def force_page(result: ExternalForce) -> Page:
     arm = result.model.arm
     warnings = [Text(str(w).removeprefix("warning: "), "warning", show="page") for w in result.warnings]
     note = "The intervals contain 95 % of the errors on recordings similar to those of the model."
-    plots = [_force_plot(result)] if np.any(result.measurable) else []
+    plots: list[Block] = [_force_plot(result), _scene(result)] if np.any(result.measurable) else []
     return Page(
         f"External force on {arm.name}",
         _answer(result),
@@ -110,7 +111,27 @@ def _force_plot(result: ExternalForce) -> Plot:
     force, width = (np.where(hidden, np.nan, x) for x in (result.force, result.half_width))
     shown = [(i, name) for i, name in enumerate(_names(result)) if np.any(result.measurable[:, i])]
     panels = [_panel(result, name, force[:, i], width[:, i], "force [N]", (i, name) == shown[-1]) for i, name in shown]
-    return Plot("force", f"Force at {_where(result)}, with its 95 % interval", panels)
+    return Plot("force", f"Force at {_where(result)}, with its 95 % interval", panels, time=True)
+
+
+def _scene(result: ExternalForce) -> Scene:
+    """Returns the arm with the force and its ellipsoid. Poses without times follow each other every second."""
+    x = _x(result)
+
+    def html() -> str:
+        from dvrk_drake.reports.playback import frame_times, playback  # slow to import, and a terminal does not need it
+        from dvrk_drake.systems.arm_view.force_arrow import DrawnForce
+
+        rows = np.unique(np.searchsorted(x, frame_times(float(x[0]), float(x[-1]))))
+        forces, contact = [], result.contact
+        for q, force, covariance in zip(result.q[rows], result.force[rows], result.covariance[rows], strict=True):
+            directions = contact.directions(q)
+            known = np.where(is_measurable(covariance), force, 0.0)
+            forces.append(DrawnForce(contact.point(q), directions @ known, directions @ covariance @ directions.T))
+        return playback(result.model.arm, x[rows], result.q[rows], forces=forces)
+
+    caption = "Force on the arm. The ellipsoid contains it with 95 % probability. Click a plot to show a time."
+    return Scene(html, caption, float(x[0]))
 
 
 def _effort_plot(result: ExternalForce) -> Plot:
@@ -126,7 +147,7 @@ def _effort_plot(result: ExternalForce) -> Plot:
         )
         for j in range(n)
     ]
-    return Plot("external_efforts", "External joint efforts, with their 95 % intervals", panels)
+    return Plot("external_efforts", "External joint efforts, with their 95 % intervals", panels, time=True)
 
 
 def _x(result: ExternalForce) -> NDArray[np.float64]:

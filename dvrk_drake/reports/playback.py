@@ -10,6 +10,7 @@ from pydrake.geometry import MeshcatAnimation, Rgba
 
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.systems.arm_view.drawn_arm import DrawnArm
+from dvrk_drake.systems.arm_view.force_arrow import FORCE_COLOR, FORCE_SCALE, DrawnForce
 from dvrk_drake.systems.arm_view.overlay import ArmOverlay
 from dvrk_drake.systems.arm_view.page import page_html, start_meshcat
 
@@ -32,6 +33,7 @@ def playback(
     tau: NDArray[np.float64] | None = None,
     *,
     ghost: NDArray[np.float64] | None = None,
+    forces: Sequence[DrawnForce] | None = None,
     phases: Sequence[tuple[float, str]] = (),
     colors: Mapping[str, str] | None = None,
     title: str = "",
@@ -44,6 +46,7 @@ def playback(
         q: Poses (m, n) of the joints [rad, m].
         tau: Efforts (m, n) of the joints [N m, N]. None: they are not drawn.
         ghost: Poses (m, n) of a second, translucent arm [rad, m]. None: there is no second arm.
+        forces: External force at each of the m times. None: there is no arrow.
         phases: Start times [s] of the phases, and their names.
         colors: CSS colours and their meanings, see `page_html`.
         title: Title of the page. "": the name of the arm.
@@ -63,6 +66,7 @@ def playback(
     links, overlay = DrawnArm(arm, meshcat, f"{arm.name.lower()}/links"), ArmOverlay(arm, meshcat, trace=False)
     if ghosts is not None:
         overlay.add_ghost(_GHOST, _GHOST_COLOUR)
+    nearest = np.abs(np.subtract.outer(times, t)).argmin(axis=1) if forces is not None else None
     meshcat.StartRecording(frames_per_second=1 / period)
     for k, pose in enumerate(poses):
         # The time is in the middle of the frame, so that rounding does not change the number of the frame.
@@ -72,6 +76,7 @@ def playback(
             pose,
             effort=None if efforts is None else efforts[k],
             ghosts=None if ghosts is None else {_GHOST: ghosts[k]},
+            force=None if forces is None or nearest is None else forces[nearest[k]],
             time=time,
         )
     overlay.end_recording(time)
@@ -81,4 +86,5 @@ def playback(
     animation.set_repetitions(10_000)
     meshcat.PublishRecording()
     relative = [(start - float(t[0]), text) for start, text in phases]
-    return page_html(meshcat, title or arm.name, phases=relative, colors=colors, effort_scale=tau is not None)
+    shown = dict(colors or {}) | ({} if forces is None else {FORCE_COLOR: FORCE_SCALE})
+    return page_html(meshcat, title or arm.name, phases=relative, colors=shown, effort_scale=tau is not None)

@@ -9,18 +9,19 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
-from pydrake.geometry import Meshcat, Rgba
+from pydrake.geometry import Box, Meshcat, Rgba
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial, PiecewisePose
 
+from dvrk_drake.dynamics.contact import Contact
 from dvrk_drake.experiments.demo.teleoperation_scene import TeleoperationScene
 from dvrk_drake.experiments.simulation import recorded_in
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.systems.hand import PoseTrajectorySource
-from dvrk_drake.systems.teleoperated_arms import TeleoperatedArms
+from dvrk_drake.systems.teleoperated_arms import TeleoperatedArms, Wall
 
 #: Ratio of the displacement of the instrument tip to the displacement of the handle.
 SCALE = 0.4
@@ -38,6 +39,8 @@ PHASES = (
 )
 DURATION = 16.0
 PERIOD = 0.02
+#: Object below the tip: distance from the start of the tip [m], stiffness of soft tissue [N/m], drawn size [m], colour.
+OBJECT_DEPTH, OBJECT_STIFFNESS, OBJECT_SIZE, OBJECT_COLOR = 0.008, 500.0, (0.1, 0.1, 0.02), Rgba(0.85, 0.55, 0.45, 0.6)
 BLUE, GREY = Rgba(0.1, 0.35, 0.75), Rgba(0.35, 0.35, 0.35)
 
 
@@ -80,7 +83,11 @@ class _Samples:
 
 
 def play_teleoperation(
-    meshcat: Meshcat | None = None, duration: float = DURATION, progress: Callable[[float], object] = lambda share: None
+    meshcat: Meshcat | None = None,
+    duration: float = DURATION,
+    progress: Callable[[float], object] = lambda share: None,
+    *,
+    force_feedback: bool = False,
 ) -> TeleoperationResult:
     """Simulates teleoperation with a prescribed motion of the hand, and records the animation.
 
@@ -90,9 +97,10 @@ def play_teleoperation(
         meshcat: Meshcat that shows the arms and their paths, see `start_scene`. None for no animation.
         duration: Duration of the simulation [s]. The whole motion lasts `DURATION`.
         progress: Function called with the finished share, 0..1.
+        force_feedback: Whether the tip can touch an object, and the master reflects the force.
     """
     builder = DiagramBuilder()
-    arms = builder.AddSystem(_make_arms(meshcat))
+    arms = builder.AddSystem(_make_arms(meshcat, force_feedback))
     scene = TeleoperationScene(arms, meshcat) if meshcat is not None else None
     start = arms.CreateDefaultContext()
     arms.SetPositions(start, START_MASTER, START_FOLLOWER)
@@ -123,15 +131,15 @@ def play_teleoperation(
     return _evaluate(samples)
 
 
-def run_live_teleoperation(meshcat: Meshcat, duration: float = np.inf) -> None:
+def run_live_teleoperation(meshcat: Meshcat, duration: float = np.inf, *, force_feedback: bool = False) -> None:
     """Simulates teleoperation in real time with controls for hand, clutch, jaw and scale in Meshcat.
 
     The simulation ends after `duration` [s], or earlier if the user clicks the button Stop. The control panel
-    shows the state of the clutch and the tracking error.
+    shows the state of the clutch and the tracking error. See `play_teleoperation` for `force_feedback`.
     """
     from pydrake.visualization import MeshcatPoseSliders  # imports matplotlib
 
-    arms = _make_arms(meshcat)
+    arms = _make_arms(meshcat, force_feedback)
     scene = TeleoperationScene(arms, meshcat)
     simulator = Simulator(arms)
     context = simulator.get_mutable_context()
@@ -181,8 +189,16 @@ class _LiveError:
         return float(np.linalg.norm(X_FT.translation() - T0 - scale * (X_MG.translation() - G0)))
 
 
-def _make_arms(meshcat: Meshcat | None) -> TeleoperatedArms:
-    return TeleoperatedArms(load_arm("mtml"), load_arm("psm"), scale=SCALE, meshcat=meshcat)
+def _make_arms(meshcat: Meshcat | None, force_feedback: bool) -> TeleoperatedArms:
+    master, follower = load_arm("mtml"), load_arm("psm")
+    if not force_feedback:
+        return TeleoperatedArms(master, follower, scale=SCALE, meshcat=meshcat)
+    top = Contact(follower).point(START_FOLLOWER) - [0.0, 0.0, OBJECT_DEPTH]
+    if meshcat is not None:
+        meshcat.SetObject("psm/object", Box(*OBJECT_SIZE), OBJECT_COLOR)
+        meshcat.SetTransform("psm/object", RigidTransform(top - [0.0, 0.0, OBJECT_SIZE[2] / 2]))
+    wall = Wall(follower, top, [0.0, 0.0, 1.0], stiffness=OBJECT_STIFFNESS)
+    return TeleoperatedArms(master, follower, scale=SCALE, meshcat=meshcat, force_model="exact", wall=wall)
 
 
 def _moved(X: RigidTransform, move: RigidTransform) -> RigidTransform:

@@ -12,6 +12,7 @@ from pydrake.systems.framework import Context
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.systems.arm_view.camera import geometry_corners
 from dvrk_drake.systems.arm_view.controls import PanelText
+from dvrk_drake.systems.arm_view.force_arrow import DrawnForce
 from dvrk_drake.systems.arm_view.overlay import ArmOverlay
 from dvrk_drake.systems.arm_view.page import add_ground, start_meshcat
 from dvrk_drake.systems.teleoperated_arms import TeleoperatedArms
@@ -32,7 +33,7 @@ class TeleoperationScene:
         self._next_text = 0.0
 
     def draw(self, arms: TeleoperatedArms, context: Context, time: float | None = None) -> None:
-        """Draws the efforts of both arms, the ghost and the trace of the tip."""
+        """Draws the efforts of both arms, the ghost and the trace of the tip, and the force if it is reflected."""
         for station, overlay in self._overlays.items():
             name, n = station.arm.name.lower(), station.arm.num_joints
             station_context = arms.GetSubsystemContext(station, context)
@@ -41,8 +42,16 @@ class TeleoperationScene:
                 station.GetPositions(station_context),
                 effort=station.GetOutputPort(f"{name}.effort_measured").Eval(station_context),
                 desired=desired,
+                force=self._force(arms, context) if station is arms.follower else None,
                 time=time,
             )
+
+    @staticmethod
+    def _force(arms: TeleoperatedArms, context: Context) -> DrawnForce | None:
+        if not arms.HasOutputPort("force"):
+            return None
+        force, covariance = (arms.GetOutputPort(name).Eval(context) for name in ("force", "force_covariance"))
+        return DrawnForce(arms.CalcX_FT(context).translation(), force, covariance.reshape(3, 3))
 
     def show_status(self, follows: bool, tracking: float | None) -> None:
         """Shows the clutch and the tracking error [m] at most twice per second."""

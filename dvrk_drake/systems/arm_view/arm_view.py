@@ -11,6 +11,7 @@ from dvrk_drake.models.plant import holding_torque, set_arm_positions
 from dvrk_drake.systems.arm_view.camera import close_up, framing, geometry_corners, home_position
 from dvrk_drake.systems.arm_view.controls import JointSliders
 from dvrk_drake.systems.arm_view.drawn_arm import DrawnArm
+from dvrk_drake.systems.arm_view.force_arrow import DrawnForce
 from dvrk_drake.systems.arm_view.overlay import ArmOverlay
 
 #: Buttons of the view, and sliders that are 0 (off) or 1 (on), so that they show their state.
@@ -63,18 +64,26 @@ class ArmView:
         """Names of camera positions for `look_at`: the whole arm, and the close-ups of the arm's file."""
         return (WHOLE_ARM, *self.arm.view.close_ups)
 
-    def show(self, q: ArrayLike, *, effort: ArrayLike | None = None, desired: ArrayLike | None = None) -> None:
+    def show(
+        self,
+        q: ArrayLike,
+        *,
+        effort: ArrayLike | None = None,
+        desired: ArrayLike | None = None,
+        force: DrawnForce | None = None,
+    ) -> None:
         """Draws the pose q (n,) [rad, m], which may be outside the limits.
 
         Args:
             q: Pose (n,) [rad, m].
             effort: Efforts (n,) [N m, N] for the arcs. None: they are not changed.
             desired: Pose (n,) [rad, m] of the ghost. None: no ghost.
+            force: External force. None: no arrow.
         """
         self._q = np.array(q, dtype=float)
         for drawn in filter(None, (self._links, self._frames)):
             drawn.draw(self._q)
-        self.overlay.draw(self._q, effort=effort, desired=desired)
+        self.overlay.draw(self._q, effort=effort, desired=desired, force=force)
 
     def look_at(self, preset: str) -> None:
         """Moves the camera to one of `camera_presets`. A close-up shows its links at the pose that was drawn last."""

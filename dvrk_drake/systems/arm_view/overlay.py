@@ -1,4 +1,4 @@
-"""Overlay of an arm in Meshcat: ghosts, efforts, remote centre of motion (RCM), trace of the tip, and state."""
+"""Overlay of an arm in Meshcat: ghosts, efforts, external force, remote centre (RCM), trace of the tip, and state."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from dvrk_drake.systems.arm_view.camera import geometry_corners, home_position
 from dvrk_drake.systems.arm_view.controls import PanelText
 from dvrk_drake.systems.arm_view.drawn_arm import COMMANDED, GhostArm
 from dvrk_drake.systems.arm_view.efforts import EffortArcs, axis_frames
+from dvrk_drake.systems.arm_view.force_arrow import FORCE_SCALE, DrawnForce, ForceArrow
 from dvrk_drake.systems.arm_view.visibility import Visibility
 
 DESIRED = "desired"
@@ -79,7 +80,8 @@ class ArmOverlay:
         self._efforts = EffortArcs(arm, meshcat, f"{self._path}/efforts", radii, self._visibility)
         self._ghosts: dict[str, GhostArm] = {}
         self._trace: deque[NDArray[np.float64]] = deque(maxlen=TRACE_POINTS)
-        self._state, self._effort_colors = PanelText(meshcat), PanelText(meshcat)
+        self._force: ForceArrow | None = None
+        self._state, self._effort_colors, self._force_scale = (PanelText(meshcat) for _ in range(3))
         self._scale, self._has_trace = 1.0, trace
         self.show_efforts(False)
         if arm.frames.remote_center:
@@ -99,6 +101,7 @@ class ArmOverlay:
         effort: ArrayLike | None = None,
         desired: ArrayLike | None = None,
         ghosts: Mapping[str, ArrayLike] | None = None,
+        force: DrawnForce | None = None,
         time: float | None = None,
     ) -> None:
         """Moves the overlay to the pose of the arm.
@@ -108,6 +111,7 @@ class ArmOverlay:
             effort: Efforts (n,) [N m, N] to show. None: the efforts remain as they are.
             desired: Desired or commanded pose (n,) [rad, m], drawn as a ghost. None: this ghost is hidden.
             ghosts: Poses of the other ghosts, see `add_ghost`. Ghosts without a pose are hidden.
+            force: External force. None: the arrow is hidden.
             time: Time in the recording of Meshcat [s]. None: the objects are not recorded.
 
         Raises:
@@ -127,6 +131,7 @@ class ArmOverlay:
         for name, ghost in self._ghosts.items():
             ghost.draw_beside(poses.get(name), q, time)
         self._move_efforts(time)
+        self._draw_force(force, time)
         if self._has_trace:
             self._draw_trace()
 
@@ -155,6 +160,14 @@ class ArmOverlay:
 
     def _move_efforts(self, time: float | None = None) -> None:
         self._efforts.move(axis_frames(self.arm, self._plant, self._context), time, self._scale)
+
+    def _draw_force(self, force: DrawnForce | None, time: float | None) -> None:
+        if self._force is None:
+            if force is None:
+                return
+            self._force = ForceArrow(self.meshcat, f"{self._path}/force", self._visibility)
+        self._force_scale.show(FORCE_SCALE if force is not None else "")
+        self._force.draw(force, time)
 
     def _draw_trace(self) -> None:
         """Adds the position of the tip to its trace.

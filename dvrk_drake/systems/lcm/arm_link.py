@@ -9,9 +9,16 @@ import lcm
 from pydrake.lcm import DrakeLcmInterface
 
 from dvrk_drake.errors import ControllerError
-from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
+from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_force, lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.lcm_messages import MessageKey, StatusFilter, command_channel, decode, status_channel
+from dvrk_drake.models.lcm_messages import (
+    MessageKey,
+    StatusFilter,
+    command_channel,
+    decode,
+    force_channel,
+    status_channel,
+)
 from dvrk_drake.systems.lcm.lcm_network import handle_message
 
 #: Length of the queue of statuses. If the queue is full, further statuses are dropped. Largest number of statuses that
@@ -53,6 +60,10 @@ class ArmLink(ABC):
     @abstractmethod
     def send(self, command: lcmt_dvrk_command) -> None:
         """Sends a command."""
+
+    def send_force(self, force: lcmt_dvrk_force) -> None:
+        """Publishes an estimated external force for other programs. The arm does not use it."""
+        raise NotImplementedError
 
     def now(self) -> float:
         """Returns the time of the computer's monotonic clock [s]."""
@@ -130,8 +141,11 @@ class MessageLink(ArmLink):
 
     def send(self, command: lcmt_dvrk_command) -> None:
         """Sends a command."""
-        data = command.encode()
-        self._publish(data if self._key is None else self._key.sign(data))
+        self._publish(self._signed(command))
+
+    def _signed(self, message: lcmt_dvrk_command | lcmt_dvrk_force) -> bytes:
+        data = message.encode()
+        return data if self._key is None else self._key.sign(data)
 
     def _receive(self, data: bytes) -> None:
         if self._replays:
@@ -174,6 +188,10 @@ class LcmArmLink(MessageLink):
         self._lcm = lcm.LCM(url)
         self._subscription = self._lcm.subscribe(self.where, lambda channel, data: self._receive(data))
         self._subscription.set_queue_capacity(_QUEUE)
+
+    def send_force(self, force: lcmt_dvrk_force) -> None:
+        """Sends an estimated external force on the channel DVRK_FORCE_<ARM>."""
+        self._lcm.publish(force_channel(self.arm), self._signed(force))
 
     def close(self) -> None:
         """Stops receiving and ends LCM's receive thread, which otherwise wakes up for every message."""

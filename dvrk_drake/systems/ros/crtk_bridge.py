@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.dynamics.identified_model import ControlModel, IdentifiedModel
-from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
+from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_force, lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import describe_state
 from dvrk_drake.systems.guard.command_guard import CommandGuard
@@ -21,6 +21,7 @@ from dvrk_drake.systems.ros.arrival_clock import ArrivalClock
 from dvrk_drake.systems.ros.crtk_client import CrtkClient, connect_client
 from dvrk_drake.systems.ros.deadman import DeadmanProcess, describe_priority
 from dvrk_drake.systems.ros.discovery import END_OTHER_PROCESS
+from dvrk_drake.systems.ros.force_topics import ForceTopics
 from dvrk_drake.systems.ros.open_domain import open_ros_domain
 
 #: Lowest rate of measured_js for POSITION and EFFORT [Hz].
@@ -64,6 +65,7 @@ class CrtkBridge:
 
     Attributes:
         guard: The command guard.
+        status: Last status, which belongs to the last measurement.
     """
 
     def __init__(
@@ -98,8 +100,9 @@ class CrtkBridge:
         )
         self._inbox = CommandInbox(self.guard, self._key)
         self._has_commands = self._awaits_answer = self._was_answered = False
-        self._status = lcmt_dvrk_status()
-        self._status.arm_name, self._status.num_joints = arm.name, arm.num_joints
+        self.status = lcmt_dvrk_status()
+        self.status.arm_name, self.status.num_joints = arm.name, arm.num_joints
+        self._force_topics: ForceTopics | None = None
         self._measured_utime, self._last_step = 0, 0
         self._nan = np.full(arm.num_joints, np.nan)
         self._measured = (self._nan, self._nan, self._nan)
@@ -151,6 +154,16 @@ class CrtkBridge:
         if is_new or (self._measured_utime and now >= self._last_step + _SILENCE):
             self._step(now)
         return is_answer
+
+    def send_force(self, force: lcmt_dvrk_force) -> None:
+        """Publishes an estimated external force on topics of this package, see `ForceTopics`.
+
+        Raises:
+            DvrkDrakeError: DDS cannot send a message.
+        """
+        if self._force_topics is None:
+            self._force_topics = ForceTopics(self._client.domain, self._client.namespace)
+        self._force_topics.publish(force)
 
     def close(self) -> bool:
         """Commands the arm to hold its present pose, and ends the deadman process.
@@ -296,7 +309,7 @@ class CrtkBridge:
 
     def _send_status(self, output: GuardOutput) -> None:
         """Sends the status of the last measurement. Without new measurements, it is repeated with the same utime."""
-        status = self._status
+        status = self.status
         q, v, effort = self._measured
         acts = output.control_mode == lcmt_dvrk_command.EFFORT and self._was_ready
         status.utime, status.sequence = self._measured_utime, status.sequence + 1

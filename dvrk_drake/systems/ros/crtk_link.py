@@ -8,6 +8,7 @@ import select
 from collections.abc import Callable
 
 from dvrk_drake.errors import StationError
+from dvrk_drake.lcmtypes import lcmt_dvrk_force
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.systems.lcm.arm_link import MessageLink
 from dvrk_drake.systems.ros.crtk_bridge import CrtkBridge, connect_bridge
@@ -80,6 +81,10 @@ class CrtkArmLink(MessageLink):
         )
         self.where = f"{self._bridge.client.namespace}/measured_js"
         _BRIDGES.append((domain_number(driver.domain), self._bridge))
+
+    def send_force(self, force: lcmt_dvrk_force) -> None:
+        """Publishes an estimated external force on topics of this package, see `ForceTopics`."""
+        self._bridge.send_force(force)
 
     def close(self) -> None:
         """Commands the arm to hold its present pose, and ends the bridge and the deadman process."""

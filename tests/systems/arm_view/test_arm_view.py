@@ -5,10 +5,11 @@ import math
 import numpy as np
 import pytest
 
+from dvrk_drake.dynamics.kinematics import ArmFrame
 from dvrk_drake.errors import ControllerError
-from dvrk_drake.lcmtypes import lcmt_dvrk_status
+from dvrk_drake.lcmtypes import lcmt_dvrk_force, lcmt_dvrk_status
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.processes.live_view import show_status
+from dvrk_drake.processes.live_view import LiveForce, show_status
 from dvrk_drake.systems.arm_view.arm_view import DEGREES, FRAMES, ArmView
 from dvrk_drake.systems.arm_view.page import start_meshcat
 
@@ -128,9 +129,33 @@ class Link:
 def test_live_view_draws_the_last_status():
     arm = load_arm("mtml")
     view, pose = ArmView(arm, start_meshcat()), [0.1, 0.2, 0.0, 0.0, 0.5, 0.0, 0.0]
-    link = Link(pose, None, [math.nan] * 7)
+    link, force = Link(pose, None, [math.nan] * 7), LiveForce(arm, "memq://")
     for _ in range(3):
-        show_status(view, link)
+        show_status(view, link, force)
         np.testing.assert_array_equal(view._q, pose)  # last drawn pose
     np.testing.assert_array_equal(view.overlay._efforts.shares, 0.5)
     assert view.meshcat.HasPath("/drake/mtml/overlay/ghost/desired/mtml/forearm_link")
+
+
+def test_live_force_is_drawn_in_the_base_frame_while_it_is_valid():
+    arm, q = load_arm("psm"), [0.2, -0.3, 0.1, 0.5, 0.2, -0.3, 0.3]
+    message, status = lcmt_dvrk_force(), lcmt_dvrk_status()
+    message.arm_name, message.frame_name, message.utime, message.session_id = arm.name, "dh_4", 10**6, 3
+    message.force, message.force_covariance = [1.0, math.nan, 2.0], np.diag([0.1, 50.0, 0.2]).tolist()
+    status.position, status.utime, status.session_id = q, 10**6 + 50_000, 3
+    live = LiveForce(arm, "memq://")
+    assert live.at(status) is None
+    live.receive(message.encode())
+    X_BF, drawn = ArmFrame(arm, "dh_4").pose(q), live.at(status)
+    np.testing.assert_allclose(drawn.point, X_BF.translation(), atol=1e-12)
+    np.testing.assert_allclose(drawn.force, X_BF.rotation() @ [1.0, 0.0, 2.0], atol=1e-12)
+    np.testing.assert_allclose(np.linalg.eigvalsh(drawn.covariance), [0.1, 0.2, 50.0], atol=1e-9)
+    message.frame_name, message.force = "unknown", [9.0, 9.0, 9.0]
+    live.receive(message.encode())
+    np.testing.assert_allclose(live.at(status).force, drawn.force, atol=0.0)
+    for change in ({"utime": 2 * 10**6}, {"session_id": 4}):
+        later = lcmt_dvrk_status()
+        later.position, later.utime, later.session_id = q, status.utime, status.session_id
+        for name, value in change.items():
+            setattr(later, name, value)
+        assert live.at(later) is None

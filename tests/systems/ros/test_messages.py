@@ -20,6 +20,8 @@ NAMES = {
     messages.JointState: "sensor_msgs/msg/JointState",
     messages.PoseStamped: "geometry_msgs/msg/PoseStamped",
     messages.TwistStamped: "geometry_msgs/msg/TwistStamped",
+    messages.WrenchStamped: "geometry_msgs/msg/WrenchStamped",
+    messages.Float64MultiArray: "std_msgs/msg/Float64MultiArray",
     messages.Bool: "std_msgs/msg/Bool",
     messages.Empty: "std_msgs/msg/Empty",
     messages.String: "std_msgs/msg/String",
@@ -44,10 +46,16 @@ POSES = st.builds(
     st.builds(messages.Point, NUMBERS, NUMBERS, NUMBERS),
     st.builds(messages.Quaternion, NUMBERS, NUMBERS, NUMBERS, NUMBERS),
 )
+SIZES = st.integers(0, 2**32 - 1)
+LAYOUTS = st.builds(
+    messages.MultiArrayLayout, st.lists(st.builds(messages.MultiArrayDimension, TEXTS, SIZES, SIZES), max_size=3), SIZES
+)
 CONTENTS = {
     messages.JointState: (HEADERS, st.lists(TEXTS, max_size=9), LISTS, LISTS, LISTS),
     messages.PoseStamped: (HEADERS, POSES),
     messages.TwistStamped: (HEADERS, st.builds(messages.Twist, VECTORS, VECTORS)),
+    messages.WrenchStamped: (HEADERS, st.builds(messages.Wrench, VECTORS, VECTORS)),
+    messages.Float64MultiArray: (LAYOUTS, LISTS),
     messages.Bool: (st.booleans(),),
     messages.Empty: (),
     messages.String: (TEXTS,),
