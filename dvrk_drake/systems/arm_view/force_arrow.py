@@ -14,9 +14,9 @@ from dvrk_drake.systems.arm_view.visibility import Visibility
 
 #: Length of the arrow [m/N]. 10 N are a quarter of the length of a PSM.
 LENGTH = 0.02
-#: Colour, which no other object has, and that of the translucent ellipsoid.
-FORCE_COLOR = "#b80d8c"
-_COLOR, _ELLIPSOID_COLOR = (Rgba(0.72, 0.05, 0.55, alpha) for alpha in (1.0, 0.3))
+#: Colour, which no other object of an overlay has, and those of arrow and ellipsoid.
+FORCE_COLOR = "#0d8026"
+_COLOR, _ELLIPSOID_COLOR = (Rgba(0.05, 0.5, 0.15, alpha) for alpha in (1.0, 0.3))
 #: Text for the control panel, which is 40 characters wide.
 FORCE_SCALE = f"force: {1e3 * LENGTH:.0f} mm per N, ellipsoid: 95 %"
 #: Square root of the 95 % quantile of the chi-squared distribution with 3 degrees of freedom.

@@ -11,7 +11,7 @@ pytest.importorskip("cyclonedds")
 from crtk_bench import CrtkBench
 
 
-def test_bridge_publishes_force_and_covariance_on_topics_of_their_own(monkeypatch):
+def test_bridge_publishes_force_and_covariance(monkeypatch):
     bridge, published = CrtkBench(monkeypatch, "psm").bridge, {}
     bridge.client.domain.advertise = lambda topic, message_type: SimpleNamespace(
         publish=lambda message: published.setdefault(topic, message)
