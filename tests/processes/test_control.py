@@ -202,7 +202,7 @@ def test_springs_of_guide_detach_during_a_watchdog_hold():
 
 def test_guide_warns_about_a_model_without_validation(monkeypatch, capsys):
     connection = SimpleNamespace(model=IdentifiedModel.from_arm(ARM), arm=ARM, run=lambda *args, **options: None)
-    monkeypatch.setattr("dvrk_drake.cli.control.connect_arm", lambda controlled, dialog: connection)
+    monkeypatch.setattr("dvrk_drake.cli.control.connect_arm", lambda controlled, dialog, **settings: connection)
     assert main(["control", "--arm", "mtml", "--mode", "guide"]) == 0
     assert capsys.readouterr().err.count("warning: the error of the model at rest is unknown") == 1
 
