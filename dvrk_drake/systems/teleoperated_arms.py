@@ -67,7 +67,7 @@ class Wall(LeafSystem):
         >>> import dvrk_drake as dvrk
         >>> wall = dvrk.Wall(dvrk.load_arm("psm"), point=[0, 0, -0.15], normal=[0, 0, 1])
         >>> context = wall.CreateDefaultContext()
-        >>> wall.GetInputPort("state_true").FixValue(context, [0.0] * 14)  # the tip is above the surface
+        >>> home = wall.GetInputPort("state_true").FixValue(context, [0.0] * 14)  # the tip is above the surface
         >>> wall.GetOutputPort("force").Eval(context).tolist()
         [0.0, 0.0, 0.0]
     """
