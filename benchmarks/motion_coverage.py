@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from dvrk_drake.analysis.estimation.motion_estimates import ResidualSeries, parameter_covariance
+from dvrk_drake.analysis.estimation.motion_problem import ConsistentFit
 from dvrk_drake.analysis.motion_identification import motion_problem
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.dynamics.dynamic_regressor import derive_base_parameters
@@ -83,7 +84,7 @@ def errors(arm: Arm, seed: int, noise: float, spread: float) -> tuple[np.ndarray
     chosen = np.arange(len(truth.effects))
     selection = problem.selection()
     selection.fit_with(chosen)
-    fit = problem.consistent(chosen, selection.weights)
+    fit = ConsistentFit(problem, chosen, selection.weights)
     residual = problem.columns.tau - problem.predict(chosen, fit.x)
     cut_off = grid.settings.effort_cut_off
     series = [ResidualSeries(slice(0, len(residual)), grid.rate, period)]

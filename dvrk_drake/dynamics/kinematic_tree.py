@@ -85,6 +85,20 @@ class KinematicTree:
         return KinematicTree(tuple(self.links[i] for i in kept), parents, **arrays)
 
     @cached_property
+    def inherited_rates(self) -> NDArray[np.float64]:
+        """Matrix (l, n) that maps dq/dt to the rotation of each parent about the axis of the link's joint [1].
+
+        It contains the joints of all successive parents with parallel axes. It is 0 if the axes are not parallel, or if
+        a joint is not revolute. The link rotates about the axis with `inherited_rates + G`.
+        """
+        rates = np.zeros_like(self.G)
+        for i, parent in enumerate(self.parents):
+            are_revolute = parent >= 0 and not self.prismatic[i] and not self.prismatic[parent]
+            if are_revolute and np.allclose(self.mounts[i, :3, 2], self.joint_poses[parent, :3, 2], rtol=0, atol=1e-9):
+                rates[i] = rates[parent] + self.G[parent]
+        return rates
+
+    @cached_property
     def arrays(self) -> TreeArrays:
         """Arrays for compiled functions."""
         affects = self.G != 0

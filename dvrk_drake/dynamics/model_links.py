@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydrake.multibody.plant import MultibodyPlant
 from pydrake.solvers import ClarabelSolver, MathematicalProgram
 
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
@@ -18,6 +17,7 @@ from dvrk_drake.dynamics.inertial_parameters import (
     parameters_from_pseudo_inertia,
     rotor_links,
 )
+from dvrk_drake.dynamics.kinematic_tree import KinematicTree
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import shared_plant
@@ -223,16 +223,15 @@ def _assign_rotors(
         Joint -> rotor inertia, actuator -> inertia of a rotor that no link contains, and descriptions of the rotors
         whose coupling terms are not represented.
     """
-    plant = shared_plant(arm)
-    rotations = _rotation_rates(plant, arm)
+    tree = KinematicTree.from_plant(shared_plant(arm), arm)
+    rates = tree.inherited_rates + tree.G
     joints = np.zeros(arm.num_joints)
     motors, couplings = {}, []
     for name, row, inertia in zip(arm.joint_names, arm.transmission.matrix, inertias, strict=True):
-        candidates = [link for link, (rate, _) in rotations.items() if np.allclose(rate, row, atol=1e-9)]
-        if np.count_nonzero(row) > 1 and candidates:
+        candidates = np.flatnonzero(~tree.prismatic & np.all(np.abs(rates - row) < 1e-9, axis=1))
+        if np.count_nonzero(row) > 1 and len(candidates):
             # All candidates rotate at the same rate, so any of them can be used. The last is part of the linkage.
-            link = candidates[-1]
-            axis = rotations[link][1]
+            link, axis = tree.links[candidates[-1]], tree.joint_poses[candidates[-1], :3, 2]
             links[link] = links[link] + inertia * np.concatenate([np.zeros(4), _unit_rotor_inertia(axis)])
             continue
         motors[name] = float(inertia)
@@ -250,27 +249,3 @@ def _unit_rotor_inertia(axis: NDArray[np.float64]) -> NDArray[np.float64]:
     """
     inertia = (np.eye(3) + np.outer(axis, axis)) / 2
     return np.concatenate([np.diag(inertia), inertia[[0, 0, 1], [1, 2, 2]]])
-
-
-def _rotation_rates(plant: MultibodyPlant, arm: Arm) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Returns link -> (rate, axis) for links with a revolute joint.
-
-    rate (n,) is the angular velocity about the joint axis per unit velocity of each independent joint. It includes the
-    rotation of parents with parallel joint axes. axis (3,) is the joint axis in the link's frame.
-    """
-    context = plant.CreateDefaultContext()
-    rotations: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
-    axes: dict[str, NDArray[np.float64]] = {}
-    for name, row in zip(arm.tree_joint_names, arm.linkage.matrix, strict=True):
-        joint = plant.GetJointByName(name)
-        if joint.type_name() != "revolute":
-            continue
-        X_WM = joint.frame_on_child().CalcPoseInWorld(context)
-        link, parent = joint.child_body(), joint.parent_body().name()
-        axis_W = X_WM.rotation() @ joint.revolute_axis()
-        X_WL = link.EvalPoseInWorld(context)
-        parallel = parent in rotations and np.allclose(axes[parent], axis_W, atol=1e-9)
-        rate = row + rotations[parent][0] if parallel else row
-        rotations[link.name()] = rate, X_WL.rotation().inverse() @ axis_W
-        axes[link.name()] = axis_W
-    return rotations

@@ -14,12 +14,12 @@ import pydrake.symbolic as symbolic
 import sympy
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
-from pydrake.multibody.plant import MultibodyPlant
 from sympy.polys.domains import RR
 from sympy.polys.orderings import lex
 from sympy.polys.rings import PolyElement, PolyRing
 
 from dvrk_drake.dynamics.gravity_parameters import GravityParameters, exact_rotation, gravity_parameters, link_frames
+from dvrk_drake.dynamics.kinematic_tree import KinematicTree
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import DH_PREFIX, shared_plant, tree_selector
 
@@ -89,7 +89,7 @@ class SymbolicPlant:
         self.q = tuple(sympy.Symbol(f"q{i + 1}", real=True) for i in range(arm.num_joints))
         self._heights: dict[str, list[symbolic.Expression]] = {}
         self._memo: dict = {}
-        self._sums = _parallel_sums(self.numeric, arm, self.q)
+        self._sums = _parallel_sums(KinematicTree.from_plant(self.numeric, arm), self.q)
         q_plant = np.empty(self._plant.num_positions(), dtype=object)
         q_plant[tree_selector(self.numeric, arm)] = _tree_positions(arm, drake_q)
         self._plant.SetPositions(self._context, q_plant)
@@ -161,29 +161,19 @@ def _tree_positions(arm: Arm, q: list[symbolic.Variable]) -> list[symbolic.Expre
     ]
 
 
-def _parallel_sums(plant: MultibodyPlant, arm: Arm, q: Sequence[sympy.Symbol]) -> list[tuple[sympy.Expr, sympy.Expr]]:
+def _parallel_sums(tree: KinematicTree, q: Sequence[sympy.Symbol]) -> list[tuple[sympy.Expr, sympy.Expr]]:
     """Returns pairs of angles whose sums occur in link poses, from the base to the tip.
 
     A pair consists of the rotation angle of a body and the angle of a revolute joint on this body. Both angles are
     about the same axis. They are linear combinations of q according to the linkage, so opposite rotations cancel in
     their sum.
     """
-    context = plant.CreateDefaultContext()
-    rotations: dict[str, tuple[NDArray[np.float64], sympy.Expr]] = {}  # Body -> axis and rotation angle.
-    sums = []
-    for name, row in zip(arm.tree_joint_names, arm.linkage.matrix, strict=True):
-        joint = plant.GetJointByName(name)
-        if joint.type_name() != "revolute":
-            continue
-        axis = joint.frame_on_parent().CalcPoseInWorld(context).rotation() @ joint.revolute_axis()
-        angle = sympy.Add(*(exact_half(row[j]) * q[int(j)] for j in np.flatnonzero(row)))
-        parent_axis, parent_angle = rotations.get(joint.parent_body().name(), (axis, sympy.Integer(0)))
-        if not np.allclose(axis, parent_axis, atol=1e-12):
-            parent_angle = sympy.Integer(0)
-        if parent_angle != 0 and (parent_angle, angle) not in sums:
-            sums.append((parent_angle, angle))
-        rotations[joint.child_body().name()] = axis, parent_angle + angle
-    return sums
+
+    def angle(rates: NDArray[np.float64]) -> sympy.Expr:
+        return sympy.Add(*(exact_half(rates[j]) * q[int(j)] for j in np.flatnonzero(rates)))
+
+    pairs = [(angle(parent), angle(own)) for parent, own in zip(tree.inherited_rates, tree.G, strict=True)]
+    return list(dict.fromkeys(pair for pair in pairs if pair[0] != 0))
 
 
 #: Coefficients with an absolute value up to this limit are rounding errors. Other coefficients are 1 or lengths [m].

@@ -62,10 +62,10 @@ class EffectSelection:
         Raises:
             IdentificationError: The solver did not converge.
         """
-        selection, fit = self, self.problem.consistent(self.effects, self.weights)
+        selection, fit = self, ConsistentFit(self.problem, self.effects, self.weights)
         if self.problem.is_loaded:
             selection = replace(self, problem=self.problem.with_fit(fit))
-            fit = selection.problem.consistent(self.effects, self.weights)
+            fit = ConsistentFit(selection.problem, self.effects, self.weights)
         return selection, fit
 
 

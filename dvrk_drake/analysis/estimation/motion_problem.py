@@ -305,14 +305,6 @@ class DynamicProblem:
         p = self.num_rigid
         return self.with_load(fit.x[:p], fit.effects, fit.x[p:])
 
-    def consistent(self, effects: NDArray[np.int_], weights: NDArray[np.float64]) -> ConsistentFit:
-        """Returns the physically consistent fit for effect indices (e,) and weights (s, n) of the recordings.
-
-        Raises:
-            IdentificationError: The solver did not converge.
-        """
-        return ConsistentFit(self, effects, weights)
-
     @cached_property
     def _identifiable(self) -> NDArray[np.float64]:
         """Orthonormal identifiable directions (p, k) of the rigid-body parameters divided by their deviations."""
@@ -339,6 +331,11 @@ class ConsistentFit:
     """
 
     def __init__(self, problem: DynamicProblem, effects: NDArray[np.int_], weights: NDArray[np.float64]) -> None:
+        """Solves the problem.
+
+        Raises:
+            IdentificationError: The solver did not converge.
+        """
         self.effects, self.weights = effects, weights
         program = ConsistentProgram(problem, effects)
         self.lower = program.lower

@@ -68,16 +68,18 @@ class FourierBasis(NamedTuple):
 
     def values(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns the functions and their first three derivatives (4, m, 2h - 1) at times t (m,) [s]."""
-        phase, w = t[:, None] * self.rates, self.rates
-        sine, cosine = np.sin(phase), np.cos(phase)
-        derivatives = [(sine, cosine), (cosine * w, -sine * w), (-sine * w**2, -cosine * w**2)]
-        derivatives.append((-cosine * w**3, sine * w**3))
-        size = self.sines.shape[1]
-        out = np.zeros((4, len(t), size + 1))
+        out = np.zeros((4, len(t), 1 + self.sines.shape[1]))
         out[0, :, 0] = 1.0
-        for k, (s, c) in enumerate(derivatives):
+        for k, (s, c) in enumerate(_harmonics(t, self.rates)):
             out[k, :, 1:] = s @ self.sines + c @ self.cosines
         return out
+
+
+def _harmonics(t: NDArray[np.float64], w: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Returns sines and cosines (m, h) of w t, and their first three derivatives, at times t (m,) for rates w (h,)."""
+    phase = t[:, None] * w
+    s, c = np.sin(phase), np.cos(phase)
+    return [(s, c), (c * w, -s * w), (-s * w**2, -c * w**2), (-c * w**3, s * w**3)]
 
 
 @dataclass
@@ -177,12 +179,6 @@ class PeriodicMotion:
         time = np.asarray(t, dtype=np.float64)
         moves = ((time > 0) & (time < self.duration))[:, None]
         rate = 2 * np.pi / self.period * np.arange(1, len(self.sine[0]) + 1)
-        phase = np.clip(time, 0.0, self.duration)[:, None] * rate
-        s, c = np.sin(phase), np.cos(phase)
         a, b = np.array(self.sine).T, np.array(self.cosine).T
-        return JointMotion(
-            np.array(self.center) + s @ a + c @ b,
-            moves * ((c * rate) @ a - (s * rate) @ b),
-            moves * -((s * rate**2) @ a + (c * rate**2) @ b),
-            moves * -((c * rate**3) @ a - (s * rate**3) @ b),
-        )
+        q, *derivatives = (s @ a + c @ b for s, c in _harmonics(np.clip(time, 0.0, self.duration), rate))
+        return JointMotion(np.array(self.center) + q, *(moves * x for x in derivatives))
