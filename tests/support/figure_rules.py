@@ -8,9 +8,6 @@ from matplotlib.text import Text
 
 from dvrk_drake.reports.image_files import DPI, SMALLEST_TEXT, WIDTH
 
-#: Axis labels of quantities without a unit in brackets.
-WITHOUT_UNIT = ("",)
-
 
 def figure_faults(figure):
     """Returns the violated rules of a figure that was drawn or saved, one text each."""

@@ -82,11 +82,6 @@ class CommandMonitor:
         times = [sent for name, sent, _ in self.receive() if name in names and sent >= after]
         return min(times, default=None)
 
-    def acts_until(self, time):
-        """Returns whether the last command before a time [ns since 1970] is an effort that is at most 20 ms old."""
-        before = [(sent, name) for name, sent, _ in self.receive() if sent < time]
-        return bool(before) and max(before)[1] == "servo_jf" and time - max(before)[0] < 20_000_000
-
     def forget(self):
         """Deletes all messages so far."""
         self.receive()

@@ -113,7 +113,6 @@ def test_hardware_and_simulation_have_the_same_ports(name):
     [
         ("arm: psm", "", r"arms\.side: arm is missing; give an arm's name"),
         ("arm: psm", "arm: pms", r"station\.yaml: arms\.side: .*pms"),
-        ("closure: ball", "closure: weld", 'closure is "weld"; allowed: mimic, ball'),
         ("[0, 0, 0.5]", "[0, 0.5]", r"arms\.side: X_PB: translation and rpy must have 3 numbers; got 2 and 3"),
         (
             "1.5707963267948966",
@@ -132,7 +131,6 @@ def test_hardware_and_simulation_have_the_same_ports(name):
         ),
         ("seed: 3", "seed: -1", r"seed is -1; allowed: 0\.\."),
         ("[friction]", "[fraction]", r"arms\.side: simulated arm: .*fraction"),
-        ("time_step: 0.002,", "time_step: x,", r'station\.yaml: plant\.time_step is "x"; allowed: a number'),
         (
             "{target_realtime_rate: 0.0, start_time: 1.0}",
             "3",
@@ -140,7 +138,6 @@ def test_hardware_and_simulation_have_the_same_ports(name):
         ),
         ("time_step: 0.002,", "time_step: 0.02,", r"plant\.time_step must be above 0 and at most 0\.01 s"),
         ("status_period: 0.002", "status_period: 0.2", r"driver\.status_period is 0\.2; allowed"),
-        ("seed: 3", "sead: 3", r'station\.yaml: arms\.side: key "sead" is unknown; did you mean "seed"\?'),
         ("  side:", "  left side:", 'the name "left side" is not valid; allowed: letters, digits and _'),
         (
             "plant:",
