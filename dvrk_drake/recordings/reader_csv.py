@@ -25,7 +25,7 @@ from dvrk_drake.recordings.csv_rows import (
 )
 from dvrk_drake.recordings.joint_states import MESSAGE_BLOCKS, JointState, collect_joint_states, joint_recording
 from dvrk_drake.recordings.layouts import Layout, find_layout
-from dvrk_drake.recordings.reader_options import FileOptions, sha256_of
+from dvrk_drake.recordings.reader_options import FileOptions, instrument_notes, sha256_of
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.recordings.topic_choice import check_namespace
 from dvrk_drake.recordings.writer_csv import UNITS
@@ -108,7 +108,7 @@ def read_csv(path: Path, options: FileOptions) -> Recording:
         path,
         {name: block[:, 0] if name == "t" else block for name, block in found.blocks.items()},
         found.rows,
-        notes=(*notes, *found.notes, *_instrument_notes(stated, arm)),
+        notes=(*notes, *found.notes, *instrument_notes(stated.get("arm", ""), arm)),
         default_rate=layout.rate,
         default_coordinates=layout.coordinates,
         lines=found.lines,
@@ -133,14 +133,6 @@ def _stated(file: CsvFile, after: int, header: list[str], arm: Arm | None) -> di
     if name and arm is not None and name.lower() != arm.name.lower():
         raise RecordingError(f"{file.path}, line {line}: the row is of {name[:30]}, but the selected arm is {arm.name}")
     return stated
-
-
-def _instrument_notes(stated: dict[str, str], arm: Arm | None) -> list[str]:
-    """Returns a note if the file states another instrument than that of the arm."""
-    _, _, instrument = stated.get("arm", "").partition("+")
-    if arm is None or not instrument or instrument == arm.instrument:
-        return []
-    return [f"recorded with the instrument {instrument}, but the selected arm has {arm.instrument or 'none'}"]
 
 
 def _message_fields(where: str, header: list[str]) -> dict[str, list[int]]:

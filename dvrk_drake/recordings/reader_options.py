@@ -152,6 +152,20 @@ class FileOptions:
         return recording.mapped(file_transmission(self.required_arm(path), "wpi").inverse, "joint")
 
 
+def instrument_notes(recorded: str, arm: Arm | None) -> list[str]:
+    """Returns a note if a file is of another instrument than that of the arm.
+
+    Args:
+        recorded: `Arm.full_name` of the recorded arm, or its name, if the instrument is not stated.
+        arm: Selected arm, if there is one.
+    """
+    _, _, instrument = recorded.partition("+")
+    # The files of the dVRK append a number to the name of an instrument.
+    if arm is None or (arm.instrument and instrument.lower().startswith(arm.instrument.lower())) or not instrument:
+        return []
+    return [f"recorded with the instrument {instrument}, but the selected arm has {arm.instrument or 'none'}"]
+
+
 def sha256_of(*paths: Path) -> str:
     """Returns the SHA-256 of the contents of files, in this order.
 

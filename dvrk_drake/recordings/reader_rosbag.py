@@ -24,14 +24,16 @@ from dvrk_drake.recordings.joint_states import (
     collect_joint_states,
     joint_recording,
 )
-from dvrk_drake.recordings.reader_options import FileOptions, sha256_of
+from dvrk_drake.recordings.reader_options import FileOptions, instrument_notes, sha256_of
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.recordings.topic_choice import choose_topic
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
-JOINT_STATE = "sensor_msgs/msg/JointState"
+JOINT_STATE, STRING = "sensor_msgs/msg/JointState", "std_msgs/msg/String"
+#: Topic, in the namespace of the arm, on which a dVRK publishes its instrument, e.g. "LARGE_NEEDLE_DRIVER:400006".
+TOOL_TYPE = "tool_type"
 #: Beginning of a file of each kind, and the suffix that the rosbags library requires.
 _MAGIC = {b"#ROSBAG V": ".bag", b"\x89MCAP0\r\n": ".mcap", b"SQLite format 3\0": ".db3"}
 _METADATA = "metadata.yaml"
@@ -80,13 +82,17 @@ def read_ros_bag(path: Path, options: FileOptions) -> Recording:
         jaw = f"{name.rpartition('/')[0]}/{arm.separate_joint}/measured_js"
         total = max(1, counts[name] + counts.get(jaw, 0))
         states = bag.read(name, options.skip_invalid, lambda done: progress(done / total))
-        jaw_states = None
+        jaw_states, instrument = None, bag.instrument(name.rpartition("/")[0])
         known, _ = arm_joint_names(f"{path}: {name}", states.names, arm, options.joints)
         if jaw in counts and [joint for joint in arm.joint_names if joint not in known] == [arm.separate_joint]:
             jaw_states = bag.read(jaw, options.skip_invalid, lambda done: progress((counts[name] + done) / total))
     progress(1.0)
     files = sorted(file for file in path.iterdir() if file.is_file()) if path.is_dir() else [path]
     recording = joint_recording(path, states, options, sha256_of(*files), jaw_states)
+    if instrument:
+        recorded = f"{arm.name}+{instrument}"
+        notes = (*recording.notes, *instrument_notes(recorded, arm))
+        recording = replace(recording, arm_name=recorded, notes=notes)
     if len(bag.parts) > 1:
         merged = f"no metadata.yaml: {', '.join(part.name for part in bag.parts)} were read as parts of one bag"
         recording = replace(recording, notes=(merged, *recording.notes))
@@ -143,6 +149,20 @@ class _Bag:
                 raise self._error(error) from error
 
         return collect_joint_states(self._path, topic, messages(), skip_invalid=skip_invalid)
+
+    def instrument(self, namespace: str) -> str:
+        """Returns the first instrument on the topic `TOOL_TYPE` of an arm, or "" if there is none."""
+        topic = f"{namespace}/{TOOL_TYPE}"
+        own = [each for each in self._reader.connections if (each.topic, each.msgtype) == (topic, STRING)]
+        if not own:
+            return ""
+        try:
+            for _, _, data in self._reader.messages(own):
+                message: Any = self._reader.deserialize(data, STRING)
+                return str(message.data).replace(":", "_")
+        except Exception as error:
+            raise self._error(error) from error
+        return ""
 
     def close(self) -> None:
         """Closes the bag."""

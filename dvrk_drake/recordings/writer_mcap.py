@@ -10,8 +10,9 @@ topic is the definition of its message, so that a reader needs no ROS installati
 | `/tf`, at most `TRANSFORM_RATE` | `tf2_msgs/TFMessage` | transforms of the moving links |
 | `/tf_static`, once | `tf2_msgs/TFMessage` | constant transforms |
 | `/<ARM>/robot_description`, once | `std_msgs/String` | URDF |
+| `/<ARM>/tool_type`, once | `std_msgs/String` | instrument, if it is not that of the arm file |
 
-`read_ros_bag` reads the topics `measured_js` and ignores the others.
+`read_ros_bag` reads the topics `measured_js` and `tool_type`, and ignores the others.
 """
 
 from __future__ import annotations
@@ -30,13 +31,13 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.recordings.growing_file import GrowingFile
 from dvrk_drake.recordings.link_frames import FrameTransform, LinkFrames, drawable_urdf
-from dvrk_drake.recordings.reader_rosbag import JOINT_STATE
+from dvrk_drake.recordings.reader_rosbag import JOINT_STATE, STRING, TOOL_TYPE
 from dvrk_drake.recordings.recording import Recording, Setpoints
 
 #: Largest rate of the messages on /tf [Hz].
 TRANSFORM_RATE = 50
 _TF, _TF_STATIC = "/tf", "/tf_static"
-_TRANSFORMS, _STRING = "tf2_msgs/msg/TFMessage", "std_msgs/msg/String"
+_TRANSFORMS = "tf2_msgs/msg/TFMessage"
 #: Header stamp of the first row of a recording [ns]. A stamp of 0 would mark invalid data.
 _FIRST_STAMP = 1_000_000_000
 #: Interval between the header stamps of poses without times [s]. A recording with such intervals is not a motion.
@@ -201,25 +202,25 @@ def joint_state_topics(
 
 
 class FrameMessages:
-    """Messages for programs that draw an arm: transforms of its links, and its URDF.
+    """Messages that describe an arm: transforms of its links, its URDF and its instrument.
 
     Attributes:
         topics: Topics of the messages.
     """
 
     def __init__(self, arm: Arm, namespace: str | None = None) -> None:
-        """Creates the messages of an arm. The URDF is on the topic `<namespace>/robot_description`."""
-        self._frames, self._urdf = LinkFrames(arm), drawable_urdf(arm)
-        self._description = f"{f'/{arm.name}' if namespace is None else namespace}/robot_description"
+        """Creates the messages of an arm, whose texts are in a namespace. Default: `/<ARM>`."""
+        self._frames = LinkFrames(arm)
         self._slot: int | None = None
-        self.topics = [Topic(_TF, _TRANSFORMS), Topic(_TF_STATIC, _TRANSFORMS)]
-        if self._urdf:
-            self.topics.append(Topic(self._description, _STRING))
+        namespace = f"/{arm.name}" if namespace is None else namespace
+        texts = {"robot_description": drawable_urdf(arm), TOOL_TYPE: arm.full_name.partition("+")[2]}
+        self._texts = {Topic(f"{namespace}/{name}", STRING): text for name, text in texts.items() if text}
+        self.topics = [Topic(_TF, _TRANSFORMS), Topic(_TF_STATIC, _TRANSFORMS), *self._texts]
 
     def write(self, bag: McapWriter, stamp: int, q: NDArray[np.float64], log_time: int | None = None) -> None:
         """Writes the transforms of the links if `TRANSFORM_RATE` permits it and all positions are finite.
 
-        The first call also writes the constant transforms and the URDF.
+        The first call also writes the constant transforms and the texts.
 
         Args:
             bag: Bag with the topics `topics`.
@@ -234,8 +235,8 @@ class FrameMessages:
         if slot == self._slot or not np.all(np.isfinite(q)):
             return
         if self._slot is None:
-            if self._urdf:
-                bag.write(self._description, bag.make(_STRING, self._urdf), stamp, log_time)
+            for topic, text in self._texts.items():
+                bag.write(topic.name, bag.make(STRING, text), stamp, log_time)
             _write_transforms(bag, _TF_STATIC, stamp, self._frames.static, log_time)
         self._slot = slot
         _write_transforms(bag, _TF, stamp, self._frames.moving(q), log_time)

@@ -119,6 +119,15 @@ def test_what_a_bag_cannot_hold_is_refused(tmp_path, change, message):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_bag_states_another_instrument(tmp_path):
+    arm = load_arm("psm", "CADIERE_FORCEPS_400049")
+    recording = Recording(q=np.zeros((3, arm.num_joints)))
+    write_recording(recording, tmp_path / "x.mcap", arm)
+    same, other = (read_recording(tmp_path / "x.mcap", which) for which in (arm, ARMS["psm"]))
+    assert same.arm_name == arm.full_name and not any("instrument" in note for note in same.notes)
+    assert any("recorded with the instrument CADIERE_FORCEPS_400049" in note for note in other.notes)
+
+
 def test_bag_needs_an_arm(tmp_path):
     with pytest.raises(RecordingError, match=r"x\.mcap: an MCAP bag contains joint names, .*: --arm"):
         write_recording(Recording(q=np.zeros((3, 7))), tmp_path / "x.mcap")

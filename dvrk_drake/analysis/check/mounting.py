@@ -48,6 +48,8 @@ MAX_SCALE = 4.0
 #: Smallest correlation between measured and nominal gravity efforts for a statement on their ratio. It is above 0.9 for
 #: three robots, and low if the gravity efforts hardly change during the motion.
 MIN_SIMILARITY = 0.8
+#: Number of combinations of joint zeros to which another change is added.
+_NUM_KEPT = 3
 #: Number of reweighted fits for the direction of gravity, after which it changes by less than 1 degree.
 _ITERATIONS = 5
 
@@ -61,9 +63,9 @@ def is_assumed(arm: Arm) -> bool:
 def find_mounting(observations: Observations) -> tuple[Arm, list[Finding]]:
     """Returns the arm with the mounting that explains a recording, and findings on the differences.
 
-    The direction of gravity and joint zeros are changed one after the other, as long as a change makes the efforts much
-    more likely. The mounting is used if the one of the arm is only assumed (`is_assumed`). Otherwise, the returned arm
-    is unchanged, and the findings advise to correct the arm file.
+    Joint zeros are changed one after the other, each with the best direction of gravity, as long as a change makes the
+    efforts much more likely. The mounting is used if the one of the arm is only assumed (`is_assumed`). Otherwise, the
+    returned arm is unchanged, and the findings advise to correct the arm file.
     """
     arm = observations.arm
     if not observations.recording.motion(arm) and len(observations.recording) < MIN_POSES:
@@ -159,21 +161,32 @@ class _Search:
         ]
 
     def best(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Returns the gravity vector (3,) [m/s^2] and the joint offsets (n,) [rad, m]."""
-        gravity, offsets = self._arm.gravity, np.zeros(self._arm.num_joints)
-        current = self._log_likelihood(gravity, offsets)
-        # Each joint and the gravity change at most once.
-        for _ in range(self._arm.num_joints + 1):
-            candidates = [(self._log_likelihood(*c), *c) for c in self._candidates(gravity, offsets)]
-            likelihood, *best = max(candidates, key=lambda candidate: candidate[0], default=(-np.inf, gravity, offsets))
-            if likelihood - current < MIN_GAIN:
+        """Returns the gravity vector (3,) [m/s^2] and the joint offsets (n,) [rad, m].
+
+        Gravity and the joint zeros can all differ from the model. Gravity is estimated for each combination of zeros,
+        because with wrong zeros its estimate is wrong too.
+        """
+        n = self._arm.num_joints
+        best = (*self._best_gravity(np.zeros(n)), np.zeros(n))
+        kept = [best]
+        for _ in range(n):
+            turned = {
+                tuple(offsets + turn * np.eye(n)[j])
+                for *_, offsets in kept
+                for j in np.flatnonzero(~self._arm.prismatic & (offsets == 0))
+                for turn in QUARTER_TURNS
+            }
+            trials = [(*self._best_gravity(np.array(offsets)), np.array(offsets)) for offsets in sorted(turned)]
+            kept = sorted(trials, key=lambda trial: -trial[0])[:_NUM_KEPT]
+            if not kept or kept[0][0] - best[0] < MIN_GAIN:
                 break
-            current, (gravity, offsets) = likelihood, best
+            best = kept[0]
+        _, gravity, offsets = best
         # The zeros of an arm of this package are checked by `check_channels`, with the priors of its links.
         joints = np.flatnonzero(~self._arm.prismatic if has_converted_model(self._arm) else offsets)
         for _ in joints:
             refined = [self._refined(gravity, offsets, int(j)) for j in joints]
-            best_offsets = max(refined, key=lambda x: self._log_likelihood(gravity, x))
+            best_offsets = max(refined, key=lambda x: self._log_likelihood(self._fit.holding_efforts(gravity, x)))
             if np.array_equal(best_offsets, offsets):
                 break
             offsets = best_offsets
@@ -185,7 +198,7 @@ class _Search:
         turn = float(offsets[joint])
 
         def cost(offset: float) -> float:
-            return -self._log_likelihood(gravity, np.where(own, offset, offsets))
+            return -self._log_likelihood(self._fit.holding_efforts(gravity, np.where(own, offset, offsets)))
 
         best = minimize_scalar(cost, bounds=(turn - np.pi / 4, turn + np.pi / 4), method="bounded")
         is_better = cost(turn) - best.fun > MIN_GAIN and abs(best.x - turn) > SNAP_ANGLE
@@ -203,20 +216,21 @@ class _Search:
         is_similar = both > MIN_SIMILARITY * np.sqrt(measured * nominal) > 0
         return float(both / nominal) if is_similar else 1.0
 
-    def _candidates(
-        self, gravity: NDArray[np.float64], offsets: NDArray[np.float64]
-    ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-        if np.array_equal(gravity, self._arm.gravity):
-            estimate = self._estimated_gravity(offsets)
-            if _angle(estimate, gravity) > MIN_ANGLE:
-                yield estimate, offsets
-        for j in np.flatnonzero(~self._arm.prismatic & (offsets == 0)):
-            for turn in QUARTER_TURNS:
-                yield gravity, offsets + turn * np.eye(len(offsets))[j]
-
-    def _estimated_gravity(self, offsets: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns the gravity vector (3,) that best explains the efforts, with the magnitude of the arm's."""
+    def _best_gravity(self, offsets: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        """Returns the log-likelihood for offsets (n,), and the stated gravity (3,) or a much more likely one."""
         unit_efforts = np.stack([self._fit.holding_efforts(axis, offsets) for axis in np.eye(3)], axis=2)
+        stated = self._log_likelihood(unit_efforts @ self._arm.gravity)
+        estimate = self._estimated_gravity(unit_efforts)
+        likelihood = self._log_likelihood(unit_efforts @ estimate)
+        is_used = _angle(estimate, self._arm.gravity) > MIN_ANGLE and likelihood - stated > MIN_GAIN
+        return (likelihood, estimate) if is_used else (stated, self._arm.gravity)
+
+    def _estimated_gravity(self, unit_efforts: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Returns the gravity vector (3,) that best explains the efforts, with the magnitude of the arm's.
+
+        Args:
+            unit_efforts: Holding efforts (r, n, 3) for a gravity of 1 m/s^2 along each axis.
+        """
         tau = self._tau - self._motion
         weights = 1 / (np.sqrt(np.mean(tau**2, axis=0)) + np.finfo(float).tiny)
         magnitude = float(np.linalg.norm(self._arm.gravity))
@@ -238,9 +252,8 @@ class _Search:
         direction = axis if _angle(g, axis) < SNAP_ANGLE else g / np.linalg.norm(g)
         return magnitude * direction
 
-    def _log_likelihood(self, gravity: NDArray[np.float64], offsets: NDArray[np.float64]) -> float:
-        """Returns the log-likelihood of the efforts, up to a constant."""
-        holding = self._fit.holding_efforts(gravity, offsets)
+    def _log_likelihood(self, holding: NDArray[np.float64]) -> float:
+        """Returns the log-likelihood of the efforts for the holding efforts (r, n) of the links, up to a constant."""
         total = 0.0
         for i in self._fit.used:
             tau = self._tau[:, i]

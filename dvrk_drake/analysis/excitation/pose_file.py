@@ -27,7 +27,7 @@ _ROUNDING = 1e-9
 
 @dataclass
 class PoseFile:
-    """Schema of a pose file: the name of the arm, and one list of n joint positions [rad, m] per pose.
+    """Schema of a pose file: `Arm.full_name`, and one list of n joint positions [rad, m] per pose.
 
     The paths between the poses avoid the objects of the environment.
     """
@@ -49,8 +49,8 @@ def load_poses(path: str | Path, arm: Arm) -> NDArray[np.float64]:
     if not os.path.lexists(path):
         raise CollectionError(f"{path}: the pose file does not exist. Create it with excite --static or collect teach.")
     content = load_typed_yaml(PoseFile, path, CollectionError, "a pose file")
-    if content.arm.lower() != arm.name.lower():
-        raise CollectionError(f'{path}: arm is "{content.arm}", but the selected arm is {arm.name}')
+    if content.arm.lower() != arm.full_name.lower():
+        raise CollectionError(f'{path}: arm is "{content.arm}", but the selected arm is {arm.full_name}')
     if not content.poses:
         raise CollectionError(f"{path} has no poses")
     for k, pose in enumerate(content.poses):
@@ -120,7 +120,7 @@ def save_poses(poses: NDArray[np.float64], arm: Arm, path: str | Path, environme
     if environment is None:
         environment = pose_environment(path) if os.path.lexists(path) else Environment()
     with atomic_write(path) as stream:
-        stream.write(f"format: {PoseFile.format}\narm: {arm.name}\n")
+        stream.write(f"format: {PoseFile.format}\narm: {arm.full_name}\n")
         if environment != Environment():
             yaml.safe_dump({"environment": asdict(environment)}, stream, sort_keys=False)
         stream.write(f"# {', '.join(arm.joint_names)} [rad, m]\nposes:\n")
@@ -139,7 +139,7 @@ class CollectionFile:
 
     - q1..qn and tau1..taun: measured positions and efforts, as in every Recording.
     - pose1..posen: requested pose.
-    - coordinates, arm: "joint", and name of the arm.
+    - coordinates, arm: "joint", and `Arm.full_name`.
     - utime: time when the row was written [us since 1970].
     - friction1..frictionn: half of the difference between the efforts of the two approach directions, if each pose is
       approached from both directions.
@@ -209,7 +209,7 @@ class CollectionFile:
             if not self._has_header:
                 self._file.append(csv_line(self._header))
         end = [] if friction is None else friction.tolist()
-        stated = "joint", self._arm.name, time.time_ns() // 1000
+        stated = "joint", self._arm.full_name, time.time_ns() // 1000
         self._file.append(csv_line([*q.tolist(), *tau.tolist(), *pose.tolist(), *stated, *end]))
 
     def close(self) -> None:
@@ -236,9 +236,9 @@ class CollectionFile:
             where = f"{self._path}, line {line}"
             if len(cells) != len(header):
                 raise RecordingError(f"{where}: the row has {len(cells)} cells, the header has {len(header)}")
-            if (name := cells[header.index("arm")]) != self._arm.name:
+            if (name := cells[header.index("arm")]) != self._arm.full_name:
                 raise CollectionError(
-                    f"{where}: the row is of {name}, not of {self._arm.name}. Choose another output file."
+                    f"{where}: the row is of {name}, not of {self._arm.full_name}. Choose another output file."
                 )
             found.append((line, np.array([parse_finite(cells[j], f"{where}: {header[j]}") for j in columns])))
         return found

@@ -68,6 +68,19 @@ def test_any_zero_that_gravity_shows_is_found(shared_data, offset):
     assert ("This is used" if is_used else "It is not used") in finding.what
 
 
+@pytest.mark.slow
+def test_gravity_and_shifted_zeros_are_found_together(shared_data):
+    folder = shared_data / "other_robots" / "ar5"
+    if not folder.is_dir():
+        pytest.skip(f"needs {folder}")
+    arm = dvrk.load_arm(folder / "ar5.urdf")
+    true = dvrk.read_recording(folder / "motion.csv", arm)
+    offsets = np.array([0.0, np.pi / 2, 0.0, -np.pi / 2, 0.0, 0.0, 0.0])
+    found, _ = find_mounting(Observations(dataclasses.replace(true, q=true.q - offsets), arm))
+    np.testing.assert_array_equal(found.gravity, [9.81, 0, 0])
+    np.testing.assert_allclose([found.position_offsets.get(n, 0.0) for n in arm.joint_names], offsets, atol=1e-9)
+
+
 def test_mounting_of_an_arm_file_is_not_replaced(path, tmp_path):
     file = tmp_path / "robot.yaml"
     file.write_text(derived_arm_file(path, tmp_path))
