@@ -253,7 +253,7 @@ def test_default_slip_effort_covers_the_error_and_the_friction():
     assert slip_effort(dataclasses.replace(MODEL, joints=joints))[0] == MAX_SLIP_SHARE * ARM.effort_limits[0]
 
 
-def test_default_slip_effort_of_a_model_of_motions_covers_its_error_in_motion():
+def test_slip_effort_of_a_model_of_motions_covers_its_error():
     error, J = 0.01 * ARM.effort_limits, ARM.transmission.matrix
     model = IdentifiedModel.from_arm(ARM, dynamics=True)
     actuators = [
