@@ -178,7 +178,7 @@ class PeriodicMotion:
         """Returns the motion at times t (m,) [s]. It is at rest before time 0 and after `duration`."""
         time = np.asarray(t, dtype=np.float64)
         moves = ((time > 0) & (time < self.duration))[:, None]
-        rate = 2 * np.pi / self.period * np.arange(1, len(self.sine[0]) + 1)
+        rate = 2 * np.pi / self.period * np.arange(1.0, len(self.sine[0]) + 1)
         a, b = np.array(self.sine).T, np.array(self.cosine).T
         q, *derivatives = (s @ a + c @ b for s, c in _harmonics(np.clip(time, 0.0, self.duration), rate))
         return JointMotion(np.array(self.center) + q, *(moves * x for x in derivatives))
