@@ -92,7 +92,7 @@ def run_arm(name: str, realtime: bool) -> None:
         read[0] = monotonic_utime()
         return read[0]
 
-    simulated = SimulatedArm(arm, DvrkDriver(), open_lcm().get_lcm_url(), start_pose(arm), clock)
+    simulated = SimulatedArm(arm, DvrkDriver(lcm_url=open_lcm().get_lcm_url()), start_pose(arm), clock)
     stopped = stop_on_signals()
     if realtime:
         for warning in make_realtime():

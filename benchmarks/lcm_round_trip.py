@@ -129,7 +129,7 @@ class TimedSimulatedArm(SimulatedArm):
 
     def __init__(self) -> None:
         self.times = Times()
-        super().__init__(ARM, DvrkDriver(), open_lcm().get_lcm_url(), start_pose(ARM))
+        super().__init__(ARM, DvrkDriver(lcm_url=open_lcm().get_lcm_url()), start_pose(ARM))
 
     @property
     def acts(self) -> bool:

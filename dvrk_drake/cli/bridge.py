@@ -1,4 +1,4 @@
-"""Commands for a dVRK arm on ROS 2: bridge and deadman."""
+"""Commands that run the driver of an arm: sim-arm, bridge and bridge deadman."""
 
 from __future__ import annotations
 
@@ -8,40 +8,29 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from dvrk_drake.cli.app import (
-    Arm,
-    Gravity,
-    Instrument,
-    Key,
-    LcmUrl,
-    Model,
-    PublishForce,
-    Realtime,
-    RosDomain,
-    RosTopic,
-    bridge,
-)
-from dvrk_drake.cli.support import driver_configuration, interrupt_ends_process, mounted, print_line, request_realtime
+import dvrk_drake as dvrk
+from dvrk_drake.cli import options, support
 from dvrk_drake.errors import ControllerError
 
 
-@bridge.default
+@options.bridge.default
 def bridge_arm(
     *,
-    arm: Arm,
-    instrument: Instrument = "",
-    topic: RosTopic = None,
-    domain: RosDomain = None,
+    arm: options.Arm,
+    instrument: options.Instrument = "",
+    topic: options.RosTopic = None,
+    domain: options.RosDomain = None,
     model: Annotated[
-        Model | None, Parameter(help="Model with which the guard checks measurements. Default: the model of the SDF.")
+        options.Model | None,
+        Parameter(help="Model with which the guard checks measurements. Default: the model of the SDF."),
     ] = None,
     driver: Annotated[str | None, Parameter(metavar="FILE.yaml")] = None,
-    lcm_url: LcmUrl = "",
-    key: Key = None,
-    gravity: Gravity = None,
-    realtime: Realtime = False,
+    lcm_url: options.LcmUrl = "",
+    key: options.Key = None,
+    gravity: options.Gravity = None,
+    realtime: options.Realtime = False,
     poll: Annotated[bool, Parameter(negative="")] = False,
-    publish_force: PublishForce = False,
+    publish_force: options.PublishForce = False,
 ) -> None:
     """Connect a dVRK arm on ROS 2 to LCM, behind a command guard.
 
@@ -53,7 +42,6 @@ def bridge_arm(
         poll: Poll for messages while a controller commands the arm. The delay decreases, but the bridge uses a
             processor core.
     """
-    from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.processes.bridge import run_bridge
     from dvrk_drake.processes.pace import settle_memory
     from dvrk_drake.processes.simulated_arm import stop_on_signals
@@ -62,12 +50,12 @@ def bridge_arm(
 
     def ready() -> None:
         settle_memory()
-        request_realtime(realtime)
+        support.request_realtime(realtime)
 
     domain_number(domain)  # rejects an invalid number before any other step
-    with interrupt_ends_process():
-        connected = mounted(load_arm(arm, instrument), gravity)
-        configuration = driver_configuration(driver, key, lcm_url)
+    with support.interrupt_ends_process():
+        connected = support.mounted(dvrk.load_arm(arm, instrument), gravity)
+        configuration = support.driver_configuration(driver, key, lcm_url)
         configuration.model = model or configuration.model
         stopped = stop_on_signals()
     print(
@@ -78,13 +66,12 @@ def bridge_arm(
     is_confirmed = run_bridge(
         connected,
         configuration,
-        configuration.lcm_url,
         topic=topic,
         domain=domain,
         polls=poll,
         publish_force=publish_force,
         stopped=stopped,
-        report=print_line,
+        report=support.print_line,
         ready=ready,
         enter=EnterKey.of_terminal(),
     )
@@ -93,14 +80,13 @@ def bridge_arm(
     print("bridge ended; the arm has confirmed hold", flush=True)
 
 
-@bridge.command
-def deadman(*, arm: Arm, topic: RosTopic = None, domain: RosDomain = None) -> None:
+@options.bridge.command
+def deadman(*, arm: options.Arm, topic: options.RosTopic = None, domain: options.RosDomain = None) -> None:
     """Hold a dVRK arm on ROS 2 when its commands stop for 50 ms.
 
     The bridge starts its own deadman process. Use this command for other programs that publish servo_jf or servo_jp, or
     on another computer.
     """
-    from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.processes.simulated_arm import stop_on_signals
     from dvrk_drake.systems.ros.deadman import Deadman, request_priority
     from dvrk_drake.systems.ros.open_domain import open_ros_domain
@@ -113,10 +99,68 @@ def deadman(*, arm: Arm, topic: RosTopic = None, domain: RosDomain = None) -> No
         with contextlib.suppress(OSError):
             print(line, flush=True)
 
-    namespace = find_arm(ros, load_arm(arm), topic, report=report)
+    namespace = find_arm(ros, dvrk.load_arm(arm), topic, report=report)
     monitor = Deadman(ros, namespace, report)
     stopped = stop_on_signals()
     # A closed terminal must not end this process.
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     print(f"deadman of {namespace}; Ctrl-C ends it; it has {priority}", flush=True)
     monitor.run(stopped)
+
+
+@options.app.command(group=options.HARDWARE)
+def sim_arm(
+    *,
+    connected: options.ConnectedArm,
+    pose: Annotated[list[float] | None, Parameter(metavar="Q ..", consume_multiple=True)] = None,
+    gravity: options.Gravity = None,
+    effects: Annotated[list[str] | None, Parameter(metavar="NAME ..", consume_multiple=True)] = None,
+    realtime: options.Realtime = False,
+    driver: Annotated[str | None, Parameter(metavar="FILE.yaml")] = None,
+    rate: Annotated[float | None, Parameter(metavar="HZ")] = None,
+    model: options.Model | None = None,
+    enabled: Annotated[bool, Parameter(show_default=False)] = False,
+) -> None:
+    """Simulate an arm with its driver, over LCM or ROS 2.
+
+    On LCM, the driver has the command guard. On ROS 2, it has the topics of a dVRK.
+
+    Args:
+        pose: Initial joint positions [rad; m if prismatic]. Default: near zero, within the joint limits.
+        effects: Simulated effects, e.g. friction, or all (docs/simulated_effects.md). Default: none.
+        driver: LCM: configuration file of the driver (docs/lcm.md). Default: the default configuration.
+        rate: ROS 2: rate of the measurements [Hz]. Default: 1000.
+        model: ROS 2: model file for the gravity compensation. Default: the nominal model from the SDF.
+        enabled: ROS 2: enable and home the arm at the start.
+    """
+    from dvrk_drake.processes.pace import settle_memory
+    from dvrk_drake.processes.simulated_arm import SimulatedArm, SimulatedRosArm, start_pose, stop_on_signals
+    from dvrk_drake.processes.teacher import EnterKey
+    from dvrk_drake.systems.ros.open_domain import domain_number
+
+    connected.check(lcm={"driver": driver}, ros={"rate": rate, "model": model, "enabled": enabled})
+    arm = support.mounted(dvrk.load_arm(connected.arm), gravity)
+    simulated_effects = None if effects is None else arm.effects.only(effects)
+    start = start_pose(arm, pose, simulated_effects)
+    simulated: SimulatedArm | SimulatedRosArm
+    if connected.is_ros:
+        domain_number(connected.domain)  # the driver has a different message, for its YAML file
+        topics = dvrk.CrtkDriver(domain=connected.domain, namespace=connected.topic or "", model=model or "")
+        topics.rate = topics.rate if rate is None else rate
+        topics.check()
+        support.request_realtime(realtime)  # the threads of DDS inherit it
+    else:
+        configuration = support.driver_configuration(driver, connected.key, connected.lcm_url)
+    support.print_line(f"starting the simulated {arm.name}")
+    with support.interrupt_ends_process():
+        if connected.is_ros:
+            simulated = SimulatedRosArm(arm, topics, start, simulated_effects, enabled=enabled)
+        else:
+            simulated = SimulatedArm(arm, configuration, start, effects=simulated_effects)
+        stopped = stop_on_signals()
+    settle_memory()
+    if not connected.is_ros:
+        support.request_realtime(realtime)
+    support.print_line(f"simulated {arm.name} on {simulated.source}; press Ctrl-C to end")
+    pace = simulated.run(stopped, support.print_line, EnterKey.of_terminal())
+    support.print_line(f"ended; {pace.describe()}")

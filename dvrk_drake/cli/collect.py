@@ -1,29 +1,21 @@
-"""Commands that record an arm: record, and collect with its subcommands."""
+"""Commands that record an arm: record, collect with its subcommands, and calibrate."""
 
 from __future__ import annotations
 
 import sys
+import termios
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from cyclopts import Parameter
 
-from dvrk_drake.cli.app import HARDWARE, ConnectedArm, ControlledArm, Seconds, app, collect, one_of
+import dvrk_drake as dvrk
+from dvrk_drake.cli import options, support
 from dvrk_drake.cli.control import connect_arm
-from dvrk_drake.cli.support import (
-    check_output,
-    interrupt_ends_process,
-    print_line,
-    print_notes,
-    print_written,
-    suggest,
-)
-from dvrk_drake.errors import CollectionError
-
-if TYPE_CHECKING:
-    from dvrk_drake.processes.connection import ArmConnection
-    from dvrk_drake.processes.live_status import LiveLine
+from dvrk_drake.errors import CollectionError, DvrkDrakeError
 
 StopOnContact = Annotated[
     float | None,
@@ -33,16 +25,16 @@ StopOnContact = Annotated[
         "requires --model, identified from a motion.",
     ),
 ]
-_TASK = one_of("Task (one is required)")
+_TASK = options.one_of("Task (one is required)")
 
 
-@app.command(group=HARDWARE)
+@options.app.command(group=options.HARDWARE)
 def record(
     file: Annotated[str, Parameter(metavar="FILE")],
     /,
     *,
-    connected: ConnectedArm,
-    duration: Annotated[Seconds | None, Parameter(metavar="S")] = None,
+    connected: options.ConnectedArm,
+    duration: Annotated[options.Seconds | None, Parameter(metavar="S")] = None,
 ) -> None:
     """Record the measurements of an arm over LCM or ROS 2.
 
@@ -52,27 +44,26 @@ def record(
         file: New file: .mcap for a bag for ROS 2 tools, Foxglove and Rerun. With LCM also .csv, or .log for an LCM log.
         duration: Duration [s], counted from the first message. Default: until Ctrl-C.
     """
-    from dvrk_drake.processes.arm_session import Dialog
     from dvrk_drake.processes.live_status import LiveLine
     from dvrk_drake.processes.simulated_arm import stop_on_signals
 
     connected.check()
     stopped, line = stop_on_signals(), LiveLine(sys.stderr)
-    connection = connected.connect(Dialog(stopped, report=line.report, show=line.show))
+    connection = connected.connect(dvrk.Dialog(stopped, report=line.report, show=line.show))
     try:
         notes = connection.record(file, float("inf") if duration is None else duration)
     finally:
         line.clear()
-    print_notes(file, notes)
-    suggest(f"dvrk-drake check {file} --arm {connected.arm}")
+    support.print_notes(file, notes)
+    support.suggest(f"dvrk-drake check {file} --arm {connected.arm}")
 
 
-@collect.command
+@options.collect.command
 def teach(
     poses: Annotated[str, Parameter(metavar="POSES.yaml")],
     /,
     *,
-    controlled: ControlledArm,
+    controlled: options.ControlledArm,
     at_rest: Annotated[bool, Parameter(show_default=False)] = False,
 ) -> None:
     """Add poses to a pose file while you move the arm by hand.
@@ -85,29 +76,25 @@ def teach(
         at_rest: Also add each pose at which the arm is at rest for one second.
     """
     controlled.check(lcm={"reset": controlled.reset})
-    check_output(poses, overwrite=True)
-    with interrupt_ends_process():
-        connection, line = _connect(controlled, keys=True)
-    event = "Enter or one second of rest" if at_rest else "Enter"
-    print(f"{event} adds a pose, Ctrl-C ends", flush=True)
-    try:
-        with interrupt_ends_process():
-            count = connection.teach(poses, at_rest=at_rest)
-    finally:
-        line.clear()
-    print_written(poses, f"{count} poses; the arm holds its pose")
-    suggest(f"dvrk-drake collect poses {poses} {controlled.as_text()} --output {Path(poses).with_suffix('.csv')}")
+    support.check_output(poses, overwrite=True)
+    with _connection(controlled, keys=True) as connection:
+        print(f"{'Enter or one second of rest' if at_rest else 'Enter'} adds a pose, Ctrl-C ends", flush=True)
+        count = connection.teach(poses, at_rest=at_rest)
+    support.print_written(poses, f"{count} poses; the arm holds its pose")
+    support.suggest(
+        f"dvrk-drake collect poses {poses} {controlled.as_text()} --output {Path(poses).with_suffix('.csv')}"
+    )
 
 
-@collect.command(name="poses")
+@options.collect.command(name="poses")
 def collect_poses(
     poses: Annotated[str, Parameter(metavar="POSES.yaml")],
     /,
     *,
-    controlled: ControlledArm,
+    controlled: options.ControlledArm,
     output: Annotated[str, Parameter(metavar="FILE.csv")],
     both_sides: Annotated[bool, Parameter(negative="--no-both-sides")] = True,
-    traverse_time: Seconds = 5.0,
+    traverse_time: options.Seconds = 5.0,
     max_effort: Annotated[float | None, Parameter(metavar="SHARE")] = None,
     stop_on_contact: StopOnContact = None,
     yes: Annotated[bool, Parameter(show_default=False)] = False,
@@ -127,30 +114,23 @@ def collect_poses(
             0.05 to 2. Default: 0.6.
         yes: ROS 2: move the arm without a question on the terminal.
     """
-    lcm_only = {"realtime": controlled.realtime, "reset": controlled.reset}
-    controlled.check(lcm=lcm_only, ros={"max_effort": max_effort, "yes": yes})
-    check_output(poses, overwrite=True)
-    check_output(output, poses, controlled.model or "", overwrite=True)
+    controlled.check(lcm={"reset": controlled.reset}, ros={"max_effort": max_effort, "yes": yes})
+    support.check_output(poses, overwrite=True)
+    support.check_output(output, poses, controlled.model or "", overwrite=True)
     given = {} if max_effort is None else {"max_effort": max_effort}
-    with interrupt_ends_process():
-        from dvrk_drake.processes.collector import CollectionSettings
-
-        settings = CollectionSettings(traverse_time, both_sides, **given)
-        connection, line = _connect(
-            controlled, keys=controlled.is_ros, confirms=controlled.is_ros and not yes, stop_on_contact=stop_on_contact
-        )
-    try:
-        with interrupt_ends_process():
-            collector = connection.collect_poses(poses, output, settings)
-    finally:
-        line.clear()
+    confirms = controlled.is_ros and not yes
+    with _connection(
+        controlled, keys=controlled.is_ros, confirms=confirms, stop_on_contact=stop_on_contact
+    ) as connection:
+        settings = dvrk.CollectionSettings(traverse_time, both_sides, **given)
+        collector = connection.collect_poses(poses, output, settings)
     if collector is None:
         if connection.dialog.stopped():
             raise KeyboardInterrupt
         return
     # Over ROS 2, a missing confirmation of `hold` was reported.
     holds = "" if controlled.is_ros else "; the arm holds its pose"
-    print_line(f"{output}: {collector.done.sum()} of {len(collector.done)} poses{holds}")
+    support.print_line(f"{output}: {collector.done.sum()} of {len(collector.done)} poses{holds}")
     if collector.problem is not None:
         raise collector.problem
     if connection.dialog.stopped():
@@ -160,15 +140,15 @@ def collect_poses(
         raise CollectionError(
             f"the arm did not come to rest at poses {numbers}. Run the command again to repeat these poses"
         )
-    suggest(f"dvrk-drake identify {output} --arm {controlled.arm} --output model.yaml")
+    support.suggest(f"dvrk-drake identify {output} --arm {controlled.arm} --output model.yaml")
 
 
-@collect.command(name="motion")
+@options.collect.command(name="motion")
 def collect_motion(
     motion: Annotated[str, Parameter(metavar="MOTION.yaml")],
     /,
     *,
-    controlled: ControlledArm,
+    controlled: options.ControlledArm,
     output: Annotated[str | None, Parameter(metavar="FILE.csv", group=_TASK)] = None,
     rehearse: Annotated[bool, Parameter(show_default=False, group=_TASK)] = False,
     stop_on_contact: StopOnContact = None,
@@ -184,41 +164,33 @@ def collect_motion(
         rehearse: Follow one period of the motion at a fifth of its speed. Required once before the first recording.
     """
     controlled.check(lcm={"reset": controlled.reset})
-    check_output(motion, overwrite=True)
+    support.check_output(motion, overwrite=True)
     if output is not None:
-        check_output(output, motion, controlled.model or "", overwrite=True)
-    with interrupt_ends_process():
-        connection, line = _connect(controlled, keys=True, stop_on_contact=stop_on_contact)
-    try:
-        with interrupt_ends_process():
-            played = connection.play(motion, output)
-    finally:
-        line.clear()
+        support.check_output(output, motion, controlled.model or "", overwrite=True)
+    with _connection(controlled, keys=True, stop_on_contact=stop_on_contact) as connection:
+        played = connection.play(motion, output)
     if played.path is not None:
         what = f"{played.begin:.1f} to {played.end:.1f} s of {played.duration:g} s"
         if output is None:
             what = f"largest tracking error {100 * played.tracking_error:.1f} % of the range of a joint"
-        print_written(played.path, what)
+        support.print_written(played.path, what)
     if not played.is_complete:
         if connection.dialog.stopped():
             raise KeyboardInterrupt
         raise CollectionError(f"{motion}: the motion ended early, at {played.end:.1f} s; run the command again")
     if output is not None:
-        from dvrk_drake.analysis.excitation.periodic_motion import PeriodicMotion
-        from dvrk_drake.processes.motion_parts import recorded_parts, useful
-
-        parts = recorded_parts(output, connection.arm, PeriodicMotion.load(motion, connection.arm))
-        files = " ".join(str(part.path) for part in useful(parts, played.duration))
-        suggest(f"dvrk-drake identify {files} --arm {controlled.arm} --output model.yaml")
+        files = " ".join(map(str, played.recordings))
+        support.suggest(f"dvrk-drake identify {files} --arm {controlled.arm} --output model.yaml")
     else:
         recording = Path(motion).with_suffix(".csv")
-        suggest(f"dvrk-drake collect motion {motion} {controlled.as_text()} --output {recording}")
+        support.suggest(f"dvrk-drake collect motion {motion} {controlled.as_text()} --output {recording}")
 
 
-def _connect(
-    controlled: ControlledArm, *, keys: bool, confirms: bool = False, stop_on_contact: float | None = None
-) -> tuple[ArmConnection, LiveLine]:
-    """Returns the connection to the arm, with a dialog on the terminal, and its status line.
+@contextmanager
+def _connection(
+    controlled: options.ControlledArm, *, keys: bool, confirms: bool = False, stop_on_contact: float | None = None
+) -> Iterator[dvrk.ArmConnection]:
+    """Context with a connection to the arm, a dialog on the terminal, and the status line.
 
     Args:
         controlled: Options of the command.
@@ -226,7 +198,6 @@ def _connect(
         confirms: Whether the operator must confirm the first motion, if there is a terminal.
         stop_on_contact: See `dvrk_drake.connect`.
     """
-    from dvrk_drake.processes.arm_session import Dialog
     from dvrk_drake.processes.live_status import LiveLine
     from dvrk_drake.processes.teacher import EnterKey
 
@@ -240,6 +211,98 @@ def _connect(
             while not connection.dialog.stopped() and not enter():
                 time.sleep(0.02)
 
-    dialog = Dialog(confirm=confirm, enter=enter, report=line.report, show=line.show)
-    connection = connect_arm(controlled, dialog, stop_on_contact=stop_on_contact)
-    return connection, line
+    dialog = dvrk.Dialog(confirm=confirm, enter=enter, report=line.report, show=line.show)
+    with support.interrupt_ends_process():
+        connection = connect_arm(controlled, dialog, stop_on_contact=stop_on_contact)
+        try:
+            yield connection
+        finally:
+            line.clear()
+
+
+@options.app.command(group=options.HARDWARE)
+def calibrate(
+    *,
+    connected: options.ConnectedArm,
+    output: Annotated[str, Parameter(metavar="FOLDER")],
+    poses: Annotated[int, Parameter(metavar="N", converter=options.whole_number)] = 40,
+    duration: options.Seconds = 30.0,
+    seed: options.Seed = 0,
+    gravity: options.Gravity = None,
+    table: options.Table = None,
+    environment: options.EnvironmentFile = None,
+    realtime: options.Realtime = False,
+    reset: Annotated[bool, Parameter(show_default=False)] = False,
+    yes: Annotated[bool, Parameter(show_default=False)] = False,
+) -> None:
+    """Calibrate a connected arm, from designed poses to a report.
+
+    The steps are: design, collect, identify, validate and export. The command runs other commands of dvrk-drake and
+    prints them. Ctrl-C ends the calibration, and the arm holds its pose. The same command continues the calibration.
+    Enter pauses a motion.
+
+    Args:
+        output: Folder for all files. An existing calibration in this folder is continued.
+        poses: Number of static poses, 8 to 300.
+        duration: Duration of the motion, 15 to 3600 s.
+        reset: Print and clear a fault of the arm before its first motion. If the watchdog of the guard holds the arm,
+            resume control.
+        yes: Move the arm without a question. Required if there is no terminal.
+    """
+    connected.check(lcm={"reset": reset})
+    support.load_key(connected.key)  # rejects an invalid file before the first step
+    around = support.load_environment(table, environment)
+    if not yes and (sys.stdin is None or not sys.stdin.isatty()):
+        raise DvrkDrakeError(f"{connected.arm} would move without a question, because there is no terminal; add --yes")
+    result = dvrk.calibrate(
+        connected.arm,
+        output,
+        poses=poses,
+        duration=duration,
+        seed=seed,
+        gravity=gravity,
+        environment=around,
+        transport=connected.transport,
+        lcm_url=connected.lcm_url,
+        key=connected.key,
+        topic=connected.topic,
+        domain=connected.domain,
+        realtime=realtime,
+        reset=reset,
+        confirm=(lambda name: None) if yes else _confirm,
+        report=support.print_line,
+    )
+    print(*result.summary(), sep="\n", flush=True)
+    support.print_line(
+        f"{result.duration / 60:.1f} min in total, of which the arm was controlled for {result.moving / 60:.1f} min"
+    )
+    for file, what in (
+        ("report.html", "errors and verdict of the full dynamics"),
+        ("holding_report.html", "errors and verdict of its holding torques at other poses"),
+        ("static_report.html", "errors and verdict of the static model"),
+        ("model_report.html", "parameters of the full dynamics"),
+        ("model.sdf", "full dynamics for Drake"),
+        ("gravity.json", "gravity compensation of the dVRK"),
+    ):
+        if (result.folder / file).exists():
+            support.print_written(result.folder / file, what)
+    if result.is_usable:
+        model = result.folder / "model.yaml"
+        support.print_line(f"In the driver's configuration of the arm: model: {model.resolve()}")
+        support.suggest(f"dvrk-drake control {connected.as_text()} --model {model} --mode guide --friction-ratio 0.3")
+    else:
+        support.print_warning("a joint failed the validation; look at the reports before you use the models")
+
+
+def _confirm(name: str) -> None:
+    """Asks the operator before a motion.
+
+    Raises:
+        KeyboardInterrupt: The input ended.
+    """
+    # Keys that were pressed before the question do not answer it.
+    termios.tcflush(sys.stdin, termios.TCIFLUSH)
+    try:
+        input(f"Clear the workspace of {name}. Enter starts the motion, Ctrl-C ends the command. ")
+    except EOFError:
+        raise KeyboardInterrupt from None

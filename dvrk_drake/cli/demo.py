@@ -1,4 +1,4 @@
-"""Commands that run experiments on simulated arms: demo, teleop and reproduce."""
+"""Commands that run experiments on simulated arms: demo, simulate teleop and reproduce."""
 
 from __future__ import annotations
 
@@ -6,29 +6,21 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from dvrk_drake.cli.app import SIMULATE, Overwrite, Port, Seed, Verbose, app
-from dvrk_drake.cli.support import (
-    Steps,
-    check_output,
-    command_words,
-    new_folder,
-    print_written,
-    show_page,
-)
+from dvrk_drake.cli import options, support
 from dvrk_drake.progress import step_progress
 
 _DEMO_STEPS = "collecting poses", "identifying", "collecting fresh poses", "simulating the release", "drawing"
 Folder = Annotated[str, Parameter(metavar="FOLDER", help="Write into this folder, which must be new or empty.")]
 
 
-@app.command(group=SIMULATE)
+@options.app.command(group=options.SIMULATE)
 def demo(
     *,
     arm: Literal["mtml", "mtmr", "psm"] = "mtml",
     folder: Folder = "demo_output",
-    seed: Seed = 0,
-    overwrite: Overwrite = False,
-    verbose: Verbose = False,
+    seed: options.Seed = 0,
+    overwrite: options.Overwrite = False,
+    verbose: options.Verbose = False,
 ) -> None:
     """Identify a model of a simulated arm, and test it.
 
@@ -38,23 +30,23 @@ def demo(
     from dvrk_drake.experiments.demo.demo import run_demo
     from dvrk_drake.reports.demo import write_demo
 
-    output = new_folder(folder, overwrite=overwrite)
-    with Steps(*_DEMO_STEPS) as steps:
+    output = support.new_folder(folder, overwrite=overwrite)
+    with support.Steps(*_DEMO_STEPS) as steps:
         result = run_demo(output, arm, seed, steps)
         steps("drawing", 0.0)
-        page = write_demo(result, output, command_words)
-    show_page(page, verbose=verbose)
-    print_written(output / "report.html", "open it in a browser")
+        page = write_demo(result, output, support.command_words)
+    support.show_page(page, verbose=verbose)
+    support.print_written(output / "report.html", "open it in a browser")
 
 
-@app.command(group=SIMULATE)
+@options.simulate.command
 def teleop(
     *,
     output: Annotated[str | None, Parameter(metavar="FILE.html")] = None,
     force_feedback: Annotated[bool, Parameter(show_default=False)] = False,
-    overwrite: Overwrite = False,
-    port: Port = None,
-    verbose: Verbose = False,
+    overwrite: options.Overwrite = False,
+    port: options.Port = None,
+    verbose: options.Verbose = False,
 ) -> None:
     """Simulate a PSM that is teleoperated with an MTM.
 
@@ -80,27 +72,27 @@ def teleop(
         )
         run_live_teleoperation(meshcat, force_feedback=force_feedback)
         return
-    check_output(output, overwrite=overwrite)
+    support.check_output(output, overwrite=overwrite)
     meshcat = start_scene(port)
-    with Steps("playing") as steps:
+    with support.Steps("playing") as steps:
         progress = step_progress(steps, "playing")
         result = play_teleoperation(meshcat, progress=progress, force_feedback=force_feedback)
     with atomic_write(output) as stream:
         colors = {FORCE_COLOR: FORCE_SCALE} if force_feedback else {}
         stream.write(page_html(meshcat, "MTML teleoperates PSM", phases=PHASES, colors=colors, effort_scale=True))
-    show_page(teleoperation_page(result, output), verbose=verbose)
-    print_written(output)
+    support.show_page(teleoperation_page(result, output), verbose=verbose)
+    support.print_written(output)
 
 
-@app.command(group=SIMULATE)
+@options.app.command(group=options.SIMULATE)
 def reproduce(
     what: Literal["table1", "fig4", "fig5", "fig6", "fig7", "psm", "transparency", "all"] = "all",
     /,
     *,
     folder: Folder = "reproduction",
     data: Annotated[str | None, Parameter(metavar="FOLDER")] = None,
-    seed: Seed = 0,
-    overwrite: Overwrite = False,
+    seed: options.Seed = 0,
+    overwrite: options.Overwrite = False,
 ) -> None:
     """Reproduce the results of the paper (Rutfield et al., 2015).
 
@@ -119,11 +111,11 @@ def reproduce(
     recordings = PaperRecordings.find(data)
     if what == "fig4":
         _ = recordings.poses  # rejects a missing recording before the folder is created
-    output = new_folder(folder, overwrite=overwrite)
+    output = support.new_folder(folder, overwrite=overwrite)
     names = NAMES if what == "all" else (what,)
-    with Steps(*names) as steps:
-        page = reproduce_paper(names, output, recordings, steps, seed=seed, command=command_words)
+    with support.Steps(*names) as steps:
+        page = reproduce_paper(names, output, recordings, steps, seed=seed, command=support.command_words)
     console = make_console()
     for section in page.sections[1:]:
         console.print(f"{section.title}: {section.finding}", markup=False)
-    print_written(output / "index.html")
+    support.print_written(output / "index.html")

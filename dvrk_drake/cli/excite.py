@@ -6,59 +6,43 @@ import os
 import shlex
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from cyclopts import Parameter
 
 import dvrk_drake as dvrk
-from dvrk_drake.cli.app import (
-    IDENTIFY,
-    Arm,
-    EnvironmentFile,
-    Gravity,
-    Instrument,
-    Seconds,
-    Seed,
-    Table,
-    app,
-    whole_number,
-    with_instrument,
-)
+from dvrk_drake.cli import options, support
 from dvrk_drake.cli.report import Results
-from dvrk_drake.cli.support import Steps, check_output, load_environment, mounted, print_written
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.workers import local_executor
-
-if TYPE_CHECKING:
-    from dvrk_drake.models.environment import Environment
 
 #: Default rate of the rows of --csv [Hz].
 DEFAULT_RATE = 200.0
 _RESULTS = Results()
 
 
-@app.command(group=IDENTIFY)
+@options.app.command(group=options.IDENTIFY)
 def excite(
     *,
-    arm: Arm,
+    arm: options.Arm,
     output: Annotated[str, Parameter(metavar="FILE.yaml")],
-    instrument: Instrument = "",
-    static: Annotated[int | None, Parameter(metavar="N", converter=whole_number)] = None,
+    instrument: options.Instrument = "",
+    static: Annotated[int | None, Parameter(metavar="N", converter=options.whole_number)] = None,
     model: Annotated[str | None, Parameter(metavar="MODEL.yaml")] = None,
     csv: Annotated[str | None, Parameter(metavar="FILE.csv")] = None,
     rate: Annotated[float | None, Parameter(metavar="HZ")] = None,
-    duration: Seconds | None = None,
-    period: Seconds | None = None,
-    harmonics: Annotated[int | None, Parameter(metavar="N", converter=whole_number)] = None,
-    starts: Annotated[int | None, Parameter(metavar="N", converter=whole_number)] = None,
-    seed: Seed = 0,
+    duration: options.Seconds | None = None,
+    period: options.Seconds | None = None,
+    harmonics: Annotated[int | None, Parameter(metavar="N", converter=options.whole_number)] = None,
+    starts: Annotated[int | None, Parameter(metavar="N", converter=options.whole_number)] = None,
+    seed: options.Seed = 0,
     margin: Annotated[float | None, Parameter(metavar="SHARE")] = None,
-    traverse_time: Seconds | None = None,
+    traverse_time: options.Seconds | None = None,
     effort: Annotated[float, Parameter(metavar="SHARE")] = 0.8,
     position: Annotated[list[str] | None, Parameter(metavar="JOINT=LOWER:UPPER ..", consume_multiple=True)] = None,
-    table: Table = None,
-    environment: EnvironmentFile = None,
-    gravity: Gravity = None,
+    table: options.Table = None,
+    environment: options.EnvironmentFile = None,
+    gravity: options.Gravity = None,
     results: Results = _RESULTS,
 ) -> None:
     """Design a motion or static poses for the identification of an arm.
@@ -86,60 +70,54 @@ def excite(
     """
     import numpy as np
 
+    from dvrk_drake.analysis.excitation.static_poses import MARGIN
     from dvrk_drake.recordings.writer_csv import write_csv
-    from dvrk_drake.reports.excitation import motion_page
+    from dvrk_drake.reports.excitation import motion_page, poses_page
 
-    of_motion = {
-        "model": model,
-        "csv": csv,
-        "rate": rate,
-        "duration": duration,
-        "period": period,
-        "harmonics": harmonics,
-        "starts": starts,
-        "traverse-time": traverse_time,
-    }
-    arm = with_instrument(arm, instrument)
-    if static is not None:
-        if given := [f"--{name}" for name, value in of_motion.items() if value is not None]:
-            raise ExcitationError(f"{' and '.join(given)} cannot be used with --static")
-        results.check(output=output)
-        around = load_environment(table, environment)
-        _select_poses(arm, output, static, seed, margin, effort, _positions(position or []), around, gravity, results)
-        return
+    design_options = {"duration": duration, "period": period, "harmonics": harmonics, "starts": starts}
+    motion_options = {"model": model, "csv": csv, "rate": rate, "traverse-time": traverse_time, **design_options}
+    if static is not None and (words := [f"--{name}" for name in options.given(motion_options)]):
+        raise ExcitationError(f"{' and '.join(words)} cannot be used with --static")
     if csv is None and rate is not None:
         raise ExcitationError("--rate requires --csv")
+    if model is not None and gravity is not None:
+        raise ExcitationError("--gravity cannot be used with --model, because the model contains the gravity vector")
     results.check(model, output=output)
     if csv is not None:
-        check_output(csv, output, overwrite=results.overwrite)
+        support.check_output(csv, output, overwrite=results.overwrite)
     rate = DEFAULT_RATE if rate is None else rate
     if not 1.0 <= rate <= 10_000.0:
         raise ExcitationError(f"--rate is {rate:g}; allowed: 1 to 10000")
+    if static is not None and margin is None:
+        margin = MARGIN
     limits = dvrk.MotionLimits(
-        margin=0.05 if margin is None else margin,
-        traverse_time=1.0 if traverse_time is None else traverse_time,
         effort=effort,
-        positions=_positions(position or []),
-        environment=load_environment(table, environment),
+        positions=options.named("position", position or [], "JOINT=LOWER:UPPER, e.g. insertion=0.05:0.2", _limits),
+        environment=support.load_environment(table, environment),
+        **options.given({"margin": margin, "traverse_time": traverse_time}),
     )
-    if model is not None and gravity is not None:
-        raise ExcitationError("--gravity cannot be used with --model, because the model contains the gravity vector")
-    moved = mounted(dvrk.load_arm(arm), gravity, None)
+    arm = options.with_instrument(arm, instrument)
+    moved = support.mounted(dvrk.load_arm(arm), gravity)
+    if static is not None:
+        with support.Steps("selecting poses") as steps:
+            poses = dvrk.design_poses(moved, static, limits=limits, seed=seed, progress=steps)
+        poses.save(output, overwrite=True)
+        recording = str(Path(output).with_suffix(".csv"))
+        collect = "dvrk-drake collect poses " + shlex.join([output, "--arm", arm, "--output", recording])
+        results.show(poses_page(poses, next_step=collect), saved=output)
+        return
     earlier = None if model is None else dvrk.IdentifiedModel.load(model, moved)
-    starts = 2 if starts is None else starts
-    pool = local_executor(min(starts, os.cpu_count() or 1)) if starts > 1 else nullcontext()
-    with Steps("optimising") as steps, pool as executor:
+    num_workers = min(2 if starts is None else starts, os.cpu_count() or 1)
+    pool = local_executor(num_workers) if num_workers > 1 else nullcontext()
+    with support.Steps("optimising") as steps, pool as executor:
         design = dvrk.design_excitation(
             moved,
-            duration=30.0 if duration is None else duration,
-            period=period,
-            harmonics=16 if harmonics is None else harmonics,
             limits=limits,
             model=earlier,
-            starts=starts,
             seed=seed,
             executor=executor,
             progress=steps,
+            **options.given(design_options),
         )
     motion = design.motion
     motion.save(output, overwrite=True)
@@ -151,48 +129,9 @@ def excite(
     collect = "dvrk-drake collect motion " + shlex.join([output, "--arm", arm]) + f"{with_model} --rehearse"
     results.show(motion_page(design, next_step=collect), model, saved=output)
     if csv is not None:
-        print_written(csv)
+        support.print_written(csv)
 
 
-def _select_poses(
-    name: str,
-    output: str,
-    count: int,
-    seed: int,
-    margin: float | None,
-    effort: float,
-    positions: dict[str, tuple[float, float]],
-    environment: Environment,
-    gravity: tuple[float, float, float] | None,
-    results: Results,
-) -> None:
-    """Selects static poses, writes the pose file and prints the expected errors."""
-    from dvrk_drake.analysis.excitation.static_poses import MARGIN
-    from dvrk_drake.reports.excitation import poses_page
-
-    limits = dvrk.MotionLimits(
-        margin=MARGIN if margin is None else margin, effort=effort, positions=positions, environment=environment
-    )
-    arm = mounted(dvrk.load_arm(name), gravity, None)
-    with Steps("selecting poses") as steps:
-        design = dvrk.design_poses(arm, count, limits=limits, seed=seed, progress=steps)
-    design.save(output, overwrite=True)
-    recording = str(Path(output).with_suffix(".csv"))
-    collect = "dvrk-drake collect poses " + shlex.join([output, "--arm", name, "--output", recording])
-    results.show(poses_page(design, next_step=collect), saved=output)
-
-
-def _positions(texts: list[str]) -> dict[str, tuple[float, float]]:
-    positions: dict[str, tuple[float, float]] = {}
-    for text in texts:
-        name, _, limits = text.partition("=")
-        if name in positions:
-            raise ExcitationError(f"--position: {name} was given twice; give each joint once")
-        lower, _, upper = limits.partition(":")
-        try:
-            positions[name] = float(lower), float(upper)
-        except ValueError:
-            raise ExcitationError(
-                f'--position: "{text}" is not of the form JOINT=LOWER:UPPER, e.g. insertion=0.05:0.2'
-            ) from None
-    return positions
+def _limits(text: str) -> tuple[float, float]:
+    lower, _, upper = text.partition(":")
+    return float(lower), float(upper)

@@ -7,40 +7,32 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Group, Parameter
 
-from dvrk_drake.cli.app import Arm, Instrument, Model, Overwrite, Verbose, export, one_of, with_instrument
+from dvrk_drake.cli import options, support
 from dvrk_drake.cli.report import ResultsAndJson
-from dvrk_drake.cli.support import (
-    Steps,
-    check_output,
-    load_model,
-    print_warning,
-    print_written,
-    show_page,
-)
 from dvrk_drake.errors import DvrkDrakeError, ModelError
 
 if TYPE_CHECKING:
     from dvrk_drake.export.model_export import Format
 
 _RESULTS = ResultsAndJson()
-_SOURCE = one_of("Source (one is required)")
+_SOURCE = options.one_of("Source (one is required)")
 _GRAVITY_COMPENSATION = Group("Options for --dvrk-gc (--gc-tolerance: also for --dvrk-kinematic-gc)")
 SourceArm = Annotated[
-    Arm | None, Parameter(group=_SOURCE, help="Use the nominal model of this arm, with the masses of the SDF.")
+    options.Arm | None, Parameter(group=_SOURCE, help="Use the nominal model of this arm, with the masses of the SDF.")
 ]
-SourceModel = Annotated[Model | None, Parameter(group=_SOURCE)]
+SourceModel = Annotated[options.Model | None, Parameter(group=_SOURCE)]
 PerJoint = Annotated[
     tuple[float, float, float, float, float, float, float] | None,
     Parameter(metavar="J1 .. J7", group=_GRAVITY_COMPENSATION),
 ]
 
 
-@export.default
+@options.export.default
 def export_model(
     *,
     model: SourceModel = None,
     arm: SourceArm = None,
-    instrument: Instrument = "",
+    instrument: options.Instrument = "",
     sdf: Annotated[str | None, Parameter(metavar="FILE.sdf")] = None,
     urdf: Annotated[str | None, Parameter(metavar="FILE.urdf")] = None,
     mjcf: Annotated[str | None, Parameter(metavar="FILE.xml")] = None,
@@ -48,8 +40,8 @@ def export_model(
     dvrk_kinematic_gc: Annotated[str | None, Parameter(metavar="FILE.json")] = None,
     configuration: Annotated[str | None, Parameter(metavar="ARM.json")] = None,
     meshes: Literal["gltf", "obj"] = "gltf",
-    overwrite: Overwrite = False,
-    verbose: Verbose = False,
+    overwrite: options.Overwrite = False,
+    verbose: options.Verbose = False,
     gc_tolerance: Annotated[float | None, Parameter(metavar="NM", group=_GRAVITY_COMPENSATION)] = None,
     friction: Annotated[bool, Parameter(show_default=False, group=_GRAVITY_COMPENSATION)] = False,
     coulomb: PerJoint = None,
@@ -99,10 +91,10 @@ def export_model(
         raise DvrkDrakeError("--configuration requires --dvrk-kinematic-gc; only the file of a PSM uses mounting_pitch")
     if instrument and arm is None:
         raise DvrkDrakeError("--instrument requires --arm; a model contains its instrument")
-    arm = with_instrument(arm, instrument) if arm else None
-    loaded = load_model(model, arm)
+    arm = options.with_instrument(arm, instrument) if arm else None
+    loaded = support.load_model(model, arm)
     for format, path in outputs.items():
-        check_output(path, model or "", configuration or "", overwrite=overwrite)
+        support.check_output(path, model or "", configuration or "", overwrite=overwrite)
         if format in MODEL_FORMATS:
             refuse_existing_meshes(path, overwrite)
     settings: dict[str, Any] = {
@@ -116,24 +108,24 @@ def export_model(
     }
     # All files are computed before the first file is written, so that an error leaves no partial output.
     origin = model or arm or ""
-    with Steps(f"exporting {loaded.arm.name}"):
+    with support.Steps(f"exporting {loaded.arm.name}"):
         exports = {format: prepare_export(loaded, format, origin=origin, **settings) for format in outputs}
     for format, path in outputs.items():
         exports[format].write(path)
     for format, path in outputs.items():
         if format != "urdf" or "sdf" not in outputs:  # both formats contain the same model
-            show_page(export_page(path, exports[format]), verbose=verbose)
+            support.show_page(export_page(path, exports[format]), verbose=verbose)
     for format, path in outputs.items():
-        print_written(path)
+        support.print_written(path)
         if format in MODEL_FORMATS and Path(path).with_name(mesh_folder(Path(path))).is_dir():
-            print_written(Path(path).with_name(mesh_folder(Path(path))), "meshes")
+            support.print_written(Path(path).with_name(mesh_folder(Path(path))), "meshes")
     if tilt := loaded.provenance.base_tilt:
         what = f"the base of the recorded arm seems to be tilted, but the model assumes that it is not ({tilt})"
         advice = "Identify again with --gravity before you use an exported file."
-        print_warning(f"{origin}: {what}. {advice}")
+        support.print_warning(f"{origin}: {what}. {advice}")
 
 
-@export.command(name="compare")
+@options.export.command(name="compare")
 def compare(
     file: str,
     /,
@@ -155,13 +147,13 @@ def compare(
 
     results.check(file, model)
     installed = GravityCompensationFile.load(file)
-    loaded, origin = load_model(model, arm), model or arm or ""
+    loaded, origin = support.load_model(model, arm), model or arm or ""
     try:
-        with Steps(f"comparing with {origin}"):
+        with support.Steps(f"comparing with {origin}"):
             comparison = compare_compensation(installed, loaded)
     except ModelError as error:
         raise ModelError(f"{file}: {error}") from error
     page = compensation_page(comparison, file_name=file, model_name=origin)
     for warning in comparison.warnings:
-        print_warning(f"{file}: {warning}")
+        support.print_warning(f"{file}: {warning}")
     results.show(page, file, model, content=comparison.as_dict())

@@ -8,34 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter, Token
 
 import dvrk_drake as dvrk
-from dvrk_drake.cli.app import (
-    GRAVITY_HELP,
-    IDENTIFY,
-    Arm,
-    FileOptions,
-    Gravity,
-    Instrument,
-    Locked,
-    Model,
-    Overwrite,
-    Recording,
-    Verbose,
-    app,
-    gravity_vector,
-    identify,
-    one_of,
-)
+from dvrk_drake.cli import options, support
 from dvrk_drake.cli.report import Results, ResultsAndJson
-from dvrk_drake.cli.support import (
-    Steps,
-    check_output,
-    load_model,
-    mounted,
-    print_notes,
-    print_warnings,
-    print_written,
-    show_page,
-)
 from dvrk_drake.errors import ModelError
 
 if TYPE_CHECKING:
@@ -49,7 +23,7 @@ def _gravity(argument: object, tokens: Sequence[Token]) -> tuple[float, float, f
         return "estimate"
     if len(tokens) != 3 and {token.keyword for token in tokens} == {"--gravity"}:
         raise ValueError("--gravity needs three numbers [m/s^2], or the word estimate")
-    return gravity_vector(argument, tokens)
+    return options.gravity_vector(argument, tokens)
 
 
 OwnGravity = Annotated[
@@ -60,8 +34,8 @@ OwnGravity = Annotated[
         converter=_gravity,
         n_tokens=-1,
         consume_multiple=True,
-        help=f"{GRAVITY_HELP} The word estimate estimates the direction from the recording. Default: the vector in the "
-        "arm file.",
+        help=f"{options.GRAVITY_HELP} The word estimate estimates the direction from the recording. "
+        "Default: the vector in the arm file.",
     ),
 ]
 Compare = Annotated[
@@ -69,24 +43,24 @@ Compare = Annotated[
     Parameter(metavar="MODEL.yaml", help="Previous model. Its errors on the recording are shown beside the new ones."),
 ]
 NewModel = Annotated[str, Parameter(metavar="MODEL.yaml", help="Model file to write.")]
-_FILE = FileOptions()
+_FILE = options.FileOptions()
 _PAGE, _RESULTS = Results(), ResultsAndJson()
 _STEPS = "reading", "checking the recording"
-_SOURCE = one_of("Source of the model (one is required)")
+_SOURCE = options.one_of("Source of the model (one is required)")
 
 
-@identify.default
+@options.identify.default
 def identify_model(
-    recording: Recording,
+    recording: options.Recording,
     /,
     *others: str,
-    arm: Arm,
+    arm: options.Arm,
     output: NewModel,
-    instrument: Instrument = "",
-    file: FileOptions = _FILE,
+    instrument: options.Instrument = "",
+    file: options.FileOptions = _FILE,
     method: Literal["robust", "paper"] = "robust",
     gravity: OwnGravity = None,
-    locked: Locked = None,
+    locked: options.Locked = None,
     compare: Compare = None,
     results: Results = _PAGE,
 ) -> None:
@@ -103,12 +77,12 @@ def identify_model(
 
     paths = (recording, *others)
     results.check(*paths, output=output)
-    recorded_arm = mounted(dvrk.load_arm(arm, instrument), None if gravity == "estimate" else gravity, locked)
-    with Steps(*_STEPS, "identifying") as steps:
+    recorded_arm = support.mounted(dvrk.load_arm(arm, instrument), None if gravity == "estimate" else gravity, locked)
+    with support.Steps(*_STEPS, "identifying") as steps:
         read = []
         for path in paths:
             read.append(file.read(path, recorded_arm, steps))
-            print_notes(path, read[-1].notes)
+            support.print_notes(path, read[-1].notes)
         result = dvrk.identify(
             read,
             recorded_arm,
@@ -124,7 +98,12 @@ def identify_model(
 
 
 def _page(
-    result: Identification | Validation, model: str, file: FileOptions, compare: str | None, *, saved: bool = False
+    result: Identification | Validation,
+    model: str,
+    file: options.FileOptions,
+    compare: str | None,
+    *,
+    saved: bool = False,
 ) -> Page:
     """Returns the page of a result, with the errors of the SDF and of the model given with --compare.
 
@@ -138,7 +117,7 @@ def _page(
     from dvrk_drake.analysis.validation import baseline_efforts
     from dvrk_drake.reports.identification import identification_page
 
-    baselines = baseline_efforts(result, None if compare is None else load_model(compare, None))
+    baselines = baseline_efforts(result, None if compare is None else support.load_model(compare, None))
     return identification_page(result, model_path=model, file_options=file.as_text(), saved=saved, baselines=baselines)
 
 
@@ -148,22 +127,22 @@ def _print_report_option(report: str | None) -> None:
 
 
 def _model_and_recording(
-    model: str, recording: str, file: FileOptions, steps: Steps
+    model: str, recording: str, file: options.FileOptions, steps: support.Steps
 ) -> tuple[dvrk.IdentifiedModel, dvrk.Recording]:
     """Loads a model and a recording of its arm, and prints the notes on the recording."""
-    loaded = load_model(model, None)
+    loaded = support.load_model(model, None)
     read = file.read(recording, loaded.arm, steps)
-    print_notes(recording, read.notes)
+    support.print_notes(recording, read.notes)
     return loaded, read
 
 
-@app.command(group=IDENTIFY)
+@options.app.command(group=options.IDENTIFY)
 def validate(
-    recording: Recording,
+    recording: options.Recording,
     /,
     *,
-    model: Model,
-    file: FileOptions = _FILE,
+    model: options.Model,
+    file: options.FileOptions = _FILE,
     compare: Compare = None,
     require: Literal["good", "usable"] | None = None,
     save: Annotated[bool, Parameter(show_default=False)] = False,
@@ -178,7 +157,7 @@ def validate(
     """
 
     results.check(recording, model)
-    with Steps(*_STEPS, "validating") as steps:
+    with support.Steps(*_STEPS, "validating") as steps:
         loaded, read = _model_and_recording(model, recording, file, steps)
         if (save or require) and loaded.provenance.includes(read.sha256):
             option = "--save" if save else "--require"
@@ -186,7 +165,7 @@ def validate(
                 f"{read.source}: the model was identified from this recording; {option} requires another recording"
             )
         if save:
-            check_output(model, recording, overwrite=True)
+            support.check_output(model, recording, overwrite=True)
             if loaded.validation is not None and not results.overwrite:
                 saved = loaded.validation.recording
                 raise ModelError(f"{model}: contains verdicts from {saved}; use --overwrite to replace them")
@@ -197,7 +176,7 @@ def validate(
     page, content = _page(validation, model, file, compare, saved=save), validation.as_dict()
     results.show(page, recording, model, content=content, note=validation.note, warnings=validation.warnings)
     if save:
-        print_written(model, "verdicts stored")
+        support.print_written(model, "verdicts stored")
     _print_report_option(results.report)
     if require is not None and (failed := validation.unfit(require)):
         advice = "identify from a recording with more varied poses"
@@ -206,15 +185,15 @@ def validate(
         raise ModelError(f"{model}: verdicts below {require} on {read.source}: {', '.join(failed)}; {advice}")
 
 
-@app.command(group=IDENTIFY)
+@options.app.command(group=options.IDENTIFY)
 def predict(
-    recording: Recording,
+    recording: options.Recording,
     /,
     *,
-    model: Model,
+    model: options.Model,
     output: Annotated[str, Parameter(metavar="FILE.csv")],
-    file: FileOptions = _FILE,
-    overwrite: Overwrite = False,
+    file: options.FileOptions = _FILE,
+    overwrite: options.Overwrite = False,
 ) -> None:
     """Predict the efforts of a recording with a model.
 
@@ -230,8 +209,8 @@ def predict(
     from dvrk_drake.recordings.writer_csv import write_csv
     from dvrk_drake.reports.terminal import make_console
 
-    check_output(output, recording, model, overwrite=overwrite)
-    with Steps(*_STEPS, "predicting") as steps:
+    support.check_output(output, recording, model, overwrite=overwrite)
+    with support.Steps(*_STEPS, "predicting") as steps:
         loaded, read = _model_and_recording(model, recording, file, steps)
         coordinates = read.file_coordinates or read.coordinates
         prediction = dvrk.predict(loaded, read, coordinates=coordinates, progress=steps)
@@ -241,22 +220,22 @@ def predict(
         if width is not None:
             columns |= {f"lower{suffix}": tau - width, f"upper{suffix}": tau + width}
     write_csv(output, columns, loaded.arm, {"coordinates": coordinates, "arm": loaded.arm.name})
-    print_warnings(make_console(), prediction.warnings)
-    print_written(output, f"{len(tau)} rows, {coordinates} coordinates")
+    support.print_warnings(make_console(), prediction.warnings)
+    support.print_written(output, f"{len(tau)} rows, {coordinates} coordinates")
     if prediction.half_width is not None:
         print(loaded.interval_scope, flush=True)
 
 
-@identify.command
+@options.identify.command
 def recalibrate(
-    recording: Recording,
+    recording: options.Recording,
     /,
     *,
-    model: Model,
+    model: options.Model,
     output: NewModel,
-    file: FileOptions = _FILE,
-    overwrite: Overwrite = False,
-    verbose: Verbose = False,
+    file: options.FileOptions = _FILE,
+    overwrite: options.Overwrite = False,
+    verbose: options.Verbose = False,
 ) -> None:
     """Refit the friction and offsets of a model to a short new motion.
 
@@ -264,28 +243,28 @@ def recalibrate(
     """
     from dvrk_drake.reports.identification import recalibration_page
 
-    check_output(output, recording, model, overwrite=overwrite)
-    with Steps(*_STEPS, "refitting friction") as steps:
+    support.check_output(output, recording, model, overwrite=overwrite)
+    with support.Steps(*_STEPS, "refitting friction") as steps:
         result = dvrk.recalibrate(*_model_and_recording(model, recording, file, steps), progress=steps)
     result.save(output, overwrite=True)
-    show_page(recalibration_page(result, model_path=output, file_options=file.as_text()), verbose=verbose)
-    print_written(output)
+    support.show_page(recalibration_page(result, model_path=output, file_options=file.as_text()), verbose=verbose)
+    support.print_written(output)
 
 
-@app.command(group=IDENTIFY)
+@options.app.command(group=options.IDENTIFY)
 def payload(
     recording: str,
     loaded: str | None = None,
     /,
     *,
     arm: Annotated[
-        Arm | None, Parameter(group=_SOURCE, help="Identify the model of this arm from the first recording.")
+        options.Arm | None, Parameter(group=_SOURCE, help="Identify the model of this arm from the first recording.")
     ] = None,
-    model: Annotated[Model | None, Parameter(group=_SOURCE, help="Model identified from a motion.")] = None,
+    model: Annotated[options.Model | None, Parameter(group=_SOURCE, help="Model identified from a motion.")] = None,
     link: Annotated[str | None, Parameter(metavar="NAME")] = None,
-    file: FileOptions = _FILE,
-    gravity: Gravity = None,
-    locked: Locked = None,
+    file: options.FileOptions = _FILE,
+    gravity: options.Gravity = None,
+    locked: options.Locked = None,
     results: ResultsAndJson = _RESULTS,
 ) -> None:
     """Estimate the mass and centre of mass of a payload.
@@ -310,12 +289,12 @@ def payload(
         )
     paths = [recording] if loaded is None else [recording, loaded]
     results.check(*paths, model)
-    identified = None if model is None else load_model(model, None)
-    recorded_arm = mounted(dvrk.load_arm(arm or ""), gravity, locked) if identified is None else identified.arm
-    with Steps(*_STEPS, *(["identifying"] if identified is None else []), "estimating") as steps:
+    identified = None if model is None else support.load_model(model, None)
+    recorded_arm = support.mounted(dvrk.load_arm(arm or ""), gravity, locked) if identified is None else identified.arm
+    with support.Steps(*_STEPS, *(["identifying"] if identified is None else []), "estimating") as steps:
         recordings = [file.read(path, recorded_arm, steps) for path in paths]
         for read in recordings:
-            print_notes(read.source, read.notes)
+            support.print_notes(read.source, read.notes)
         reference = recordings[0] if loaded else None
         result = dvrk.payload(reference, recordings[-1], identified or recorded_arm, link, progress=steps)
     options = file.as_text() + ("" if gravity is None else f" --gravity {' '.join(map(repr, gravity))}")
@@ -327,12 +306,12 @@ def payload(
 _VECTOR = Parameter(metavar="X Y Z")
 
 
-@app.command(group=IDENTIFY)
+@options.app.command(group=options.IDENTIFY)
 def force(
-    recording: Recording,
+    recording: options.Recording,
     /,
     *,
-    model: Model,
+    model: options.Model,
     frame: Annotated[str, Parameter(metavar="NAME", show_default=False)] = "",
     point: Annotated[tuple[float, float, float], _VECTOR] = (0.0, 0.0, 0.0),
     axes: Literal["base", "frame"] = "base",
@@ -340,7 +319,7 @@ def force(
     cannula: Annotated[bool, Parameter(show_default=False)] = False,
     same_day: Annotated[bool, Parameter(show_default=False)] = False,
     output: Annotated[str | None, Parameter(metavar="FILE.csv")] = None,
-    file: FileOptions = _FILE,
+    file: options.FileOptions = _FILE,
     results: Results = _PAGE,
 ) -> None:
     """Estimate the force on a point of the arm over a recording.
@@ -362,7 +341,7 @@ def force(
     from dvrk_drake.reports.external_force import force_page
 
     results.check(recording, model, output=output)
-    with Steps(*_STEPS, "estimating the force") as steps:
+    with support.Steps(*_STEPS, "estimating the force") as steps:
         loaded, read = _model_and_recording(model, recording, file, steps)
         result = dvrk.estimate_force(
             read,

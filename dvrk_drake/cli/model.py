@@ -8,20 +8,20 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from dvrk_drake.cli.app import MODEL, Arm, Gravity, Instrument, LcmUrl, Overwrite, Port, app
-from dvrk_drake.cli.support import Steps, check_output, command_again, mounted, print_written, show_page, until_stopped
+import dvrk_drake as dvrk
+from dvrk_drake.cli import options, support
 from dvrk_drake.errors import DvrkDrakeError
 
 
-@app.command(group=MODEL)
+@options.app.command(group=options.MODEL)
 def equations(
     *,
-    arm: Arm,
-    instrument: Instrument = "",
+    arm: options.Arm,
+    instrument: options.Instrument = "",
     format: Literal["latex", "python", "c"] | None = None,
     output: Annotated[str | None, Parameter(metavar="FILE")] = None,
-    overwrite: Overwrite = False,
-    gravity: Gravity = None,
+    overwrite: options.Overwrite = False,
+    gravity: options.Gravity = None,
 ) -> None:
     """Show the base parameters of gravity, or generate source code.
 
@@ -31,19 +31,18 @@ def equations(
     """
     from dvrk_drake.dynamics.symbolic_gravity import SymbolicPlant, derive_gravity
     from dvrk_drake.export import gravity_sources
-    from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.models.files import atomic_write
     from dvrk_drake.reports.model import symbolic_model_page
 
     if output is not None:
         if format is None:
             raise DvrkDrakeError("--output requires --format latex, python or c")
-        check_output(output, overwrite=overwrite)
-    shown = mounted(load_arm(arm, instrument), gravity)
-    with Steps("deriving the gravity torque"):
+        support.check_output(output, overwrite=overwrite)
+    shown = support.mounted(dvrk.load_arm(arm, instrument), gravity)
+    with support.Steps("deriving the gravity torque"):
         derived = derive_gravity(shown)
     if format is None:
-        show_page(symbolic_model_page(derived, command=command_again("--format", "latex")))
+        support.show_page(symbolic_model_page(derived, command=support.command_again("--format", "latex")))
         return
     writers = {
         "latex": lambda: gravity_sources.to_latex(derived, SymbolicPlant(shown).frame_poses()),
@@ -56,16 +55,16 @@ def equations(
         return
     with atomic_write(output) as stream:
         stream.write(text)
-    print_written(output)
+    support.print_written(output)
 
 
-@app.command(group=MODEL)
+@options.app.command(group=options.MODEL)
 def arm_file(
     model_file: Annotated[str, Parameter(metavar="MODEL_FILE")],
     /,
     *,
     output: Annotated[str, Parameter(metavar="FILE.yaml")],
-    overwrite: Overwrite = False,
+    overwrite: options.Overwrite = False,
 ) -> None:
     """Write an arm file that describes a model file.
 
@@ -81,21 +80,21 @@ def arm_file(
 
     if not output.lower().endswith((".yaml", ".yml")):
         raise DvrkDrakeError(f"--output {output}: the name of an arm file ends in .yaml")
-    check_output(output, overwrite=overwrite)
+    support.check_output(output, overwrite=overwrite)
     text = derived_arm_file(model_file, Path(output).parent)
     with atomic_write(output) as stream:
         stream.write(text)
-    print_written(output, f"use it as --arm {output}")
+    support.print_written(output, f"use it as --arm {output}")
 
 
-@app.command(group=MODEL)
+@options.app.command(group=options.MODEL)
 def view(
     *,
-    arm: Arm,
-    instrument: Instrument = "",
+    arm: options.Arm,
+    instrument: options.Instrument = "",
     live: Annotated[bool, Parameter(show_default=False)] = False,
-    lcm_url: LcmUrl = "",
-    port: Port = None,
+    lcm_url: options.LcmUrl = "",
+    port: options.Port = None,
 ) -> None:
     """Show an arm in a web browser.
 
@@ -106,26 +105,24 @@ def view(
         live: Show the measured pose and efforts from the LCM messages of the arm, the commanded pose as a ghost, and
             the external force if it is published (--publish-force of control and bridge).
     """
-    from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.processes.live_view import LiveForce, show_status
     from dvrk_drake.systems.arm_view.arm_view import ArmView
-    from dvrk_drake.systems.arm_view.page import start_meshcat
     from dvrk_drake.systems.lcm.arm_link import LcmArmLink
     from dvrk_drake.systems.lcm.lcm_network import open_lcm
 
     if lcm_url and not live:
         raise DvrkDrakeError("--lcm-url requires --live")
-    shown = load_arm(arm, instrument)
+    shown = dvrk.load_arm(arm, instrument)
     url = open_lcm(lcm_url).get_lcm_url() if live else ""
-    meshcat = start_meshcat(shown, port=port)
+    meshcat = dvrk.start_meshcat(shown, port=port)
     arm_view = ArmView(shown, meshcat)
     arm_view.add_view_buttons()
     ending = "press Stop, Escape or Ctrl-C to end"
     if live:
         link, force = LcmArmLink(shown, url, replays=True), LiveForce(shown, url)
         print(f"{shown.name} live at {meshcat.web_url()}; {ending}", flush=True)
-        until_stopped(meshcat, lambda: show_status(arm_view, link, force))
+        support.until_stopped(meshcat, lambda: show_status(arm_view, link, force))
         return
     arm_view.add_sliders()
     print(f"{shown.name} at {meshcat.web_url()}; the controls are under Open Controls; {ending}", flush=True)
-    until_stopped(meshcat, arm_view.follow_controls)
+    support.until_stopped(meshcat, arm_view.follow_controls)

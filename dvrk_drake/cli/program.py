@@ -23,9 +23,8 @@ from cyclopts import (
     ValidationError,
 )
 
-from dvrk_drake.cli import (
+from dvrk_drake.cli import (  # noqa: F401, these modules add their commands to the application
     bridge,
-    calibrate,
     collect,
     control,
     demo,
@@ -35,9 +34,8 @@ from dvrk_drake.cli import (
     model,
     recordings,
     simulate,
-    simulated_arm,
 )
-from dvrk_drake.cli.app import app
+from dvrk_drake.cli.options import app
 from dvrk_drake.cli.support import (
     command_words,
     folders_only_for_results,
@@ -50,22 +48,6 @@ from dvrk_drake.errors import DvrkDrakeError
 # The matrices are small. Several BLAS threads would mostly wait for each other: minutes on a busy computer.
 # The variable must be set before numpy is imported, which happens in the commands.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-#: Importing these modules adds their commands to the application.
-COMMANDS = (
-    model,
-    recordings,
-    identify,
-    excite,
-    export,
-    simulate,
-    demo,
-    simulated_arm,
-    control,
-    bridge,
-    collect,
-    calibrate,
-)
 
 #: Mapping from required options to the accepted values, for the message of a missing option.
 REQUIRED = {

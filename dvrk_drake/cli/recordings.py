@@ -3,46 +3,22 @@
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from cyclopts import Parameter
 
 import dvrk_drake as dvrk
-from dvrk_drake.cli.app import (
-    IDENTIFY,
-    Arm,
-    FileOptions,
-    Locked,
-    Model,
-    Overwrite,
-    Recording,
-    app,
-    one_of,
-)
+from dvrk_drake.cli import options, support
 from dvrk_drake.cli.report import ResultsAndJson
-from dvrk_drake.cli.support import (
-    Steps,
-    check_output,
-    load_model,
-    mounted,
-    new_folder,
-    print_notes,
-    print_written,
-    suggest,
-)
 from dvrk_drake.errors import ModelError, RecordingError
 
-if TYPE_CHECKING:
-    from dvrk_drake.models.arm import Arm as LoadedArm
-    from dvrk_drake.recordings.recording import Recording as LoadedRecording
-
-_FILE = FileOptions()
+_FILE = options.FileOptions()
 _RESULTS = ResultsAndJson()
-_SOURCE = one_of("Arm or its model (one is required)")
+_SOURCE = options.one_of("Arm or its model (one is required)")
 
 
-@app.command(group=IDENTIFY)
-def samples(folder: str, /, *, overwrite: Overwrite = False) -> None:
+@options.app.command(group=options.IDENTIFY)
+def samples(folder: str, /, *, overwrite: options.Overwrite = False) -> None:
     """Write sample recordings of simulated arms, as CSV and MCAP.
 
     Args:
@@ -50,25 +26,26 @@ def samples(folder: str, /, *, overwrite: Overwrite = False) -> None:
     """
     from dvrk_drake.recordings.samples import SAMPLES
 
-    target = new_folder(folder, overwrite=overwrite)
-    with Steps("writing") as steps:
+    target = support.new_folder(folder, overwrite=overwrite)
+    with support.Steps("writing") as steps:
         files = dvrk.write_samples(target, overwrite=True, progress=steps)
     for file in files:
-        print_written(file)
-    suggest(f"dvrk-drake check {files[0]} --arm {SAMPLES[files[0].stem]}")
+        support.print_written(file)
+    support.suggest(f"dvrk-drake check {files[0]} --arm {SAMPLES[files[0].stem]}")
 
 
-@app.command(group=IDENTIFY)
+@options.app.command(group=options.IDENTIFY)
 def check(
-    recording: Recording,
+    recording: options.Recording,
     /,
     *,
-    arm: Annotated[Arm | None, Parameter(group=_SOURCE)] = None,
+    arm: Annotated[options.Arm | None, Parameter(group=_SOURCE)] = None,
     model: Annotated[
-        Model | None, Parameter(group=_SOURCE, help="Model of the arm. A motion of another individual arm is reported.")
+        options.Model | None,
+        Parameter(group=_SOURCE, help="Model of the arm. A motion of another individual arm is reported."),
     ] = None,
-    file: FileOptions = _FILE,
-    locked: Locked = None,
+    file: options.FileOptions = _FILE,
+    locked: options.Locked = None,
     results: ResultsAndJson = _RESULTS,
 ) -> None:
     """Check a recording and report its problems.
@@ -80,10 +57,10 @@ def check(
 
     if model is not None and locked is not None:
         raise ModelError("--locked requires --arm; with --model, the locked joints of the model are used")
-    identified = None if model is None else load_model(model, None)
-    recorded_arm = mounted(dvrk.load_arm(arm or ""), None, locked) if identified is None else identified.arm
+    identified = None if model is None else support.load_model(model, None)
+    recorded_arm = support.mounted(dvrk.load_arm(arm or ""), None, locked) if identified is None else identified.arm
     results.check(recording, model)
-    with Steps("reading", "checking the recording") as steps:
+    with support.Steps("reading", "checking the recording") as steps:
         checked = file.read(recording, recorded_arm, steps)
         report = dvrk.check(checked, identified or recorded_arm, progress=steps)
     options = f"--arm {arm}{locked_option(recorded_arm)}" if model is None else f"--model {model}"
@@ -98,18 +75,18 @@ def check(
     )
     results.show(page, recording, model, content=report.as_dict())
     if results.plots is not None and not has_spectra(report):
-        print_notes(recording, ["no plots were written; spectra require a motion with efforts and time stamps"])
+        support.print_notes(recording, ["no plots were written; spectra require a motion with efforts and time stamps"])
     for refusal in report.refusals[1:]:
         print(f"dvrk-drake: {refusal}", file=sys.stderr)
     if report.refusals:
         raise RecordingError(report.refusal)
 
 
-def _other_arm(recording: LoadedRecording, arm: LoadedArm) -> str:
+def _other_arm(recording: dvrk.Recording, arm: dvrk.Arm) -> str:
     """Returns the arm of a recording that is outside the limits of `arm`, "ARM" if several arms fit, "" if none."""
     from dvrk_drake.models.arm_files import known_arms
 
-    def fits(tested: LoadedArm) -> bool:
+    def fits(tested: dvrk.Arm) -> bool:
         try:
             recording.check_fits(tested)
         except RecordingError:
@@ -122,16 +99,16 @@ def _other_arm(recording: LoadedRecording, arm: LoadedArm) -> str:
     return fitting[0] if len(fitting) == 1 else "ARM" if fitting else ""
 
 
-@app.command(group=IDENTIFY)
+@options.app.command(group=options.IDENTIFY)
 def convert(
-    recording: Recording,
+    recording: options.Recording,
     /,
     *,
     output: Annotated[str, Parameter(metavar="FILE")],
-    file: FileOptions = _FILE,
+    file: options.FileOptions = _FILE,
     arm: Annotated[str | None, Parameter(metavar="ARM")] = None,
-    locked: Locked = None,
-    overwrite: Overwrite = False,
+    locked: options.Locked = None,
+    overwrite: options.Overwrite = False,
 ) -> None:
     """Convert a recording to a CSV with a header, or to an MCAP bag.
 
@@ -142,12 +119,12 @@ def convert(
     """
     from dvrk_drake.recordings.writing import convert as convert_recording
 
-    check_output(output, recording, overwrite=overwrite)
+    support.check_output(output, recording, overwrite=overwrite)
     if arm is None and locked is not None:
         raise RecordingError("--locked requires --arm")
-    loaded = None if arm is None else mounted(dvrk.load_arm(arm), None, locked)
-    with Steps("reading") as steps:
+    loaded = None if arm is None else support.mounted(dvrk.load_arm(arm), None, locked)
+    with support.Steps("reading") as steps:
         converted = convert_recording(recording, output, arm=loaded, progress=steps, **file.as_arguments())
-    print_written(output, f"{len(converted)} rows, {converted.coordinates} coordinates")
+    support.print_written(output, f"{len(converted)} rows, {converted.coordinates} coordinates")
     for note in converted.notes:
         print(note)

@@ -10,18 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from dvrk_drake.cli.app import Overwrite, Verbose
-from dvrk_drake.cli.support import (
-    Steps,
-    check_output,
-    command_words,
-    interrupt_ends_process,
-    plots_folder,
-    print_warnings,
-    print_written,
-    show_page,
-    write_json,
-)
+from dvrk_drake.cli import options, support
 from dvrk_drake.errors import DvrkDrakeError
 
 if TYPE_CHECKING:
@@ -44,8 +33,8 @@ class Results:
 
     plots: Plots = None
     report: Report = None
-    overwrite: Overwrite = False
-    verbose: Verbose = False
+    overwrite: options.Overwrite = False
+    verbose: options.Verbose = False
 
     def check(self, *inputs: str | None, output: str | None = None) -> None:
         """Checks all output paths before work begins, and creates the folder of the plots.
@@ -59,9 +48,9 @@ class Results:
         """
         given = list(filter(None, inputs))
         for path in filter(None, (output, self._json)):
-            check_output(path, *given, overwrite=self.overwrite)
+            support.check_output(path, *given, overwrite=self.overwrite)
         check_report(self.report, *given, overwrite=self.overwrite)
-        plots_folder(self.plots, overwrite=self.overwrite)
+        support.plots_folder(self.plots, overwrite=self.overwrite)
 
     def show(
         self,
@@ -86,14 +75,14 @@ class Results:
 
         # Results are saved before printing, because the reader of the output (e.g. head) may close the pipe.
         if self._json is not None:
-            write_json(self._json, content)
-        show_page(page, verbose=self.verbose)
+            support.write_json(self._json, content)
+        support.show_page(page, verbose=self.verbose)
         console = make_console()
         if note:
             console.print(note)
-        print_warnings(console, warnings)
+        support.print_warnings(console, warnings)
         for path in filter(None, (saved, self._json)):
-            print_written(path)
+            support.print_written(path)
         write_page(page, self.plots, self.report, *filter(None, inputs))
 
     @property
@@ -124,8 +113,8 @@ def check_report(path: str | None, *inputs: str, overwrite: bool) -> None:
         return
     if not path.lower().endswith((".html", ".htm")):
         raise DvrkDrakeError(f"{path}: --report writes HTML; the name of the file must end in .html")
-    check_output(path, *inputs, overwrite=overwrite)
-    with interrupt_ends_process():
+    support.check_output(path, *inputs, overwrite=overwrite)
+    with support.interrupt_ends_process():
         importlib.import_module("dvrk_drake.reports.html_file")
 
 
@@ -144,10 +133,10 @@ def write_page(page: Page, folder: Path | str | None, path: str | None, *inputs:
         from dvrk_drake.reports.image_files import write_images
 
         if write_images(page, Path(folder)):
-            print_written(folder)
+            support.print_written(folder)
     if path is not None:
         from dvrk_drake.reports.html_file import write_html
 
-        with Steps("writing the report"):
-            write_html(page, path, Provenance.of(inputs, command_words))
-        print_written(path, "report")
+        with support.Steps("writing the report"):
+            write_html(page, path, Provenance.of(inputs, support.command_words))
+        support.print_written(path, "report")

@@ -1,4 +1,4 @@
-"""Commands that simulate an arm: simulate, with its subcommands study, tune and transparency."""
+"""Commands that simulate an arm: simulate, with its subcommands study, tune and transparency (teleop: demo.py)."""
 
 from __future__ import annotations
 
@@ -10,29 +10,28 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 import dvrk_drake as dvrk
-from dvrk_drake.cli.app import Arm, FileOptions, Instrument, Set, one_of, simulate, whole_number, with_instrument
+from dvrk_drake.cli import options, support
 from dvrk_drake.cli.report import Results
-from dvrk_drake.cli.support import Steps, check_output, command_again, until_stopped
 from dvrk_drake.errors import ScenarioError, StudyError
 from dvrk_drake.progress import step_progress
 
-_FILE = FileOptions()
+_FILE = options.FileOptions()
 _RESULTS = Results()
-_SCENARIO = one_of("Source (one is required)")
-_EXECUTOR = one_of("Computers (at most one option)", least=0)
+_SCENARIO = options.one_of("Source (one is required)")
+_EXECUTOR = options.one_of("Computers (at most one option)", least=0)
 
 
-@simulate.default
+@options.simulate.default
 def simulate_scenario(
     scenario: Annotated[str | None, Parameter(group=_SCENARIO)] = None,
     /,
     *,
     arm: Annotated[
-        Arm | None,
+        options.Arm | None,
         Parameter(group=_SCENARIO, help="Regulate this arm at its home position."),
     ] = None,
-    instrument: Instrument = "",
-    set: Set = None,
+    instrument: options.Instrument = "",
+    set: options.Set = None,
     output: Annotated[str | None, Parameter(metavar="RECORDING")] = None,
     meshcat: Annotated[bool, Parameter(show_default=False)] = False,
     results: Results = _RESULTS,
@@ -53,14 +52,14 @@ def simulate_scenario(
         raise ScenarioError(
             "--instrument requires --arm; a scenario states it as e.g. arm: psm+PROGRASP_FORCEPS_400093"
         )
-    arm = with_instrument(arm, instrument) if arm else None
+    arm = options.with_instrument(arm, instrument) if arm else None
     source = arm or scenario or ""
     loaded = dvrk.load_scenario(source, set or [])
     results.check(source, loaded.controller.model, output=output)
     page = dvrk.start_meshcat(loaded.mounted_arm) if meshcat else None
     if page is not None:
         print(f"{loaded.mounted_arm.name} at {page.web_url()}", flush=True)
-    with Steps("simulating") as steps:
+    with support.Steps("simulating") as steps:
         simulation = dvrk.simulate(loaded, meshcat=page, progress=steps)
     argument = (scenario or f"--arm {arm}") + _set_options(set) if results.plots is None else None
     if output is not None:
@@ -69,7 +68,7 @@ def simulate_scenario(
     results.show(result, scenario, saved=output)
     if page is not None:
         print("the page can replay the motion; press Stop, Escape or Ctrl-C to end", flush=True)
-        until_stopped(page)
+        support.until_stopped(page)
 
 
 def _set_options(values: Sequence[str] | None) -> str:
@@ -82,15 +81,15 @@ def _check_workers(_: object, value: int | None) -> None:
         raise ValueError("must be a number of processes from 1 to 1024")
 
 
-@simulate.command
+@options.simulate.command
 def study(
     study: str,
     /,
     *,
     output: Annotated[str, Parameter(metavar="RESULTS.csv")],
-    set: Set = None,
+    set: options.Set = None,
     workers: Annotated[
-        int | None, Parameter(metavar="N", group=_EXECUTOR, converter=whole_number, validator=_check_workers)
+        int | None, Parameter(metavar="N", group=_EXECUTOR, converter=options.whole_number, validator=_check_workers)
     ] = None,
     scheduler: Annotated[str | None, Parameter(metavar="ADDRESS", group=_EXECUTOR)] = None,
     results: Results = _RESULTS,
@@ -110,10 +109,10 @@ def study(
     loaded = load_study(study, set or [])
     if not output.lower().endswith(".csv"):
         raise StudyError(f"{output}: must end in .csv")
-    check_output(output, overwrite=True)
+    support.check_output(output, overwrite=True)
     results.check(study)
     step = f"simulating {len(loaded.cases)} runs"
-    with Steps(step) as steps:
+    with support.Steps(step) as steps:
 
         def show(done: int, all_cases: int) -> None:
             steps(step, done / all_cases)
@@ -127,10 +126,10 @@ def study(
     results.show(page, study, output, saved=output)
 
 
-@simulate.command
+@options.simulate.command
 def tune(
     *,
-    arm: Arm,
+    arm: options.Arm,
     method: Annotated[
         Literal["paper", "model", "both"],
         Parameter(
@@ -149,15 +148,14 @@ def tune(
         output: File for the gains. With method both, the better gains are written.
     """
     from dvrk_drake.experiments.tuning.tuning import Method, tune_arm
-    from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.models.arm_schema import save_gains
     from dvrk_drake.reports.tuning import tuning_page
 
-    tuned = load_arm(arm)
+    tuned = dvrk.load_arm(arm)
     results.check(arm, output=output)
     methods: list[Method] = ["paper", "model"] if method == "both" else [method]
     step = f"tuning {tuned.name}"
-    with Steps(step) as steps:
+    with support.Steps(step) as steps:
         tuning = tune_arm(arm, methods, step_progress(steps, step))
     best = tuning.comparison.best(tuning.found)
     if output is not None:
@@ -165,12 +163,12 @@ def tune(
     results.show(tuning_page(tuning, gains_path=output), saved=output)
 
 
-@simulate.command
+@options.simulate.command
 def transparency(
     *,
-    arm: Arm,
+    arm: options.Arm,
     path: Annotated[str | None, Parameter(metavar="RECORDING")] = None,
-    file: FileOptions = _FILE,
+    file: options.FileOptions = _FILE,
     speed: Annotated[float | None, Parameter(metavar="S")] = None,
     model: Annotated[list[str] | None, Parameter(metavar="MODEL.yaml")] = None,
     friction_ratio: Annotated[float | None, Parameter(metavar="R", show_default=False)] = None,
@@ -193,10 +191,9 @@ def transparency(
         output: CSV file for the results.
     """
     from dvrk_drake.experiments.transparency import listed_compensations, random_path, recorded_path, simulate_operator
-    from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.reports.transparency import transparency_page, write_transparency
 
-    moved_arm = load_arm(arm)
+    moved_arm = dvrk.load_arm(arm)
     effects = moved_arm.effects.only(simulated_effects or ["all"])
     followed = random_path(moved_arm)
     if path is not None:
@@ -212,7 +209,7 @@ def transparency(
     results.check(path, *(model or []), output=output)
     forces = []
     names = [f"compensation by {one.name}" if one.model else "no compensation" for one in compensations]
-    with Steps(*names) as steps:
+    with support.Steps(*names) as steps:
         for name, compensation in zip(names, compensations, strict=True):
             progress = step_progress(steps, name)
             forces.append(
@@ -222,4 +219,6 @@ def transparency(
             )
     if output is not None:
         write_transparency(Path(output), forces)
-    results.show(transparency_page(moved_arm, forces, command=command_again()), path, *(model or []), saved=output)
+    results.show(
+        transparency_page(moved_arm, forces, command=support.command_again()), path, *(model or []), saved=output
+    )

@@ -30,8 +30,8 @@ from rich.progress import (
 )
 
 import dvrk_drake as dvrk
-from dvrk_drake.cli import leave
-from dvrk_drake.errors import ArmError, DvrkDrakeError, ModelError
+from dvrk_drake.cli import leave, options
+from dvrk_drake.errors import DvrkDrakeError, ModelError
 
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
@@ -321,23 +321,19 @@ def mounted(arm: Arm, gravity: Sequence[float] | None, locked: Sequence[str] | N
         locked: Arguments NAME=POSITION of --locked. None: no locked joints.
 
     Raises:
-        ArmError: The gravity vector or a locked joint is not valid.
+        DvrkDrakeError: The gravity vector or a locked joint is not valid.
     """
     if gravity is not None:
         arm = arm.with_gravity(gravity)
-    positions: dict[str, float] = {}
-    for argument in locked or ():
-        name, _, number = argument.partition("=")
-        try:
-            position = float(number)
-        except ValueError:
-            position = math.nan
-        if not (name and math.isfinite(position)):
-            raise ArmError(f"--locked {argument}: allowed: NAME=POSITION [rad, m], e.g. {arm.joint_names[-1]}=0")
-        if name in positions:
-            raise ArmError(f"--locked {argument}: {name} is given twice; give one position for each joint")
-        positions[name] = position
-    return dvrk.lock_joints(arm, positions)
+    form = f"NAME=POSITION [rad, m], e.g. {arm.joint_names[-1]}=0"
+    return dvrk.lock_joints(arm, options.named("locked", locked or (), form, finite))
+
+
+def finite(text: str) -> float:
+    """Returns the number in a text. Raises ValueError if it is not finite."""
+    if not math.isfinite(number := float(text)):
+        raise ValueError
+    return number
 
 
 class Steps:

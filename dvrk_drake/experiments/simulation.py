@@ -24,8 +24,7 @@ from dvrk_drake.models.loop_closure import Closure
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.recording import Recording, Setpoints
 from dvrk_drake.systems.arm_station import ArmStation, arm_plant_config
-from dvrk_drake.systems.arm_view.overlay import ArmOverlay
-from dvrk_drake.systems.arm_view.overlay_publisher import add_overlay
+from dvrk_drake.systems.arm_view.overlay import ArmOverlay, add_overlay
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.friction_compensator import FrictionCompensator
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController, Mode

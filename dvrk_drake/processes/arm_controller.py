@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +17,14 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.approach import approach_offset
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_schema import Gains
+from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.effort_ramp import EffortRamp
 from dvrk_drake.systems.friction_compensator import FrictionCompensator
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController, Mode
 from dvrk_drake.systems.hardware_arm_station import HardwareArmStation
 from dvrk_drake.systems.lcm.arm_link import ArmLink
-from dvrk_drake.systems.lcm.dvrk_command import draw_id, make_command
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.lcm.messages import draw_id, make_command
 
 #: Proportional effort of the controller at the start of an approach, divided by the effort limit. This effort
 #: determines the distance of the approach. Static friction that is at most half of this effort changes its sign during
@@ -165,27 +167,13 @@ class ArmController:
         self._link, self.style = _Exchange(arm), MotionStyle.of_efforts(arm)
         driver = DvrkDriver()
         driver.status_period = period  # measured, and thus not limited to the range of the configuration
-        station = builder.AddSystem(HardwareArmStation(arm, driver=driver, link=self._link))
+        station = HardwareArmStation(arm, driver=driver, link=self._link)
         self._mode = mode if isinstance(mode, str) else None
-        own = (
-            mode
-            if not isinstance(mode, str)
-            else GravityPidController(model, period=period, gains=gains, mode="gravity")
-        )
-        self._controller = builder.AddSystem(own)
-        self._ramp = builder.AddSystem(EffortRamp(arm.num_joints, period=period))
-        name, desired_effort = arm.name.lower(), self._controller.GetOutputPort("effort")
-        state = station.GetOutputPort(f"{name}.state_estimated")
-        builder.Connect(state, self._controller.GetInputPort("state_estimated"))
-        if friction is not None:
-            builder.AddSystem(friction)
-            builder.Connect(state, friction.GetInputPort("state_estimated"))
-            builder.Connect(desired_effort, friction.GetInputPort("effort_wanted"))
-            desired_effort = friction.GetOutputPort("effort")
-        builder.Connect(desired_effort, self._ramp.GetInputPort("effort_wanted"))
-        for port, measured in (("effort_measured", "effort_measured"), ("enabled", "in_control")):
-            builder.Connect(station.GetOutputPort(f"{name}.{measured}"), self._ramp.GetInputPort(port))
-        builder.Connect(self._ramp.GetOutputPort("effort"), station.GetInputPort(f"{name}.effort_commanded"))
+        self._controller: Any = mode
+        if isinstance(mode, str):
+            self._controller = GravityPidController(model, period=period, gains=gains, mode="gravity")
+        self._ramp = EffortRamp(arm.num_joints, period=period)
+        add_closed_loop(builder, station, self._controller, friction=friction, ramp=self._ramp)
         self._simulator = Simulator(builder.Build())
         context = self._simulator.get_mutable_context()
         self._ramp_context = self._ramp.GetMyContextFromRoot(context)

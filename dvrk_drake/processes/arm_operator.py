@@ -14,7 +14,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import describe_refusal, describe_state
 from dvrk_drake.processes.control import FIRST_WAIT, SILENCE
 from dvrk_drake.systems.lcm.arm_link import ArmLink
-from dvrk_drake.systems.lcm.dvrk_command import draw_id, make_command
+from dvrk_drake.systems.lcm.messages import draw_id, make_command
 
 #: Longest time for which a guard ignores new senders after the last command of a sender, plus a margin [s].
 _SENDER_RESERVED = 1.1

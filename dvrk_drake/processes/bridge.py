@@ -30,7 +30,6 @@ _PAUSE = 0.0002
 def run_bridge(
     arm: Arm,
     driver: DvrkDriver,
-    url: str,
     *,
     topic: str | None,
     domain: int | None,
@@ -45,8 +44,7 @@ def run_bridge(
 
     Args:
         arm: Arm on ROS 2.
-        driver: Configuration of the guard; `driver.status_period` is not used.
-        url: URL of the LCM network.
+        driver: Configuration of the guard and of the LCM network; `driver.status_period` is not used.
         topic: Topic measured_js of the arm or its namespace; see `find_arm`.
         domain: ROS domain. None: the environment variable ROS_DOMAIN_ID, or else 0.
         polls: Whether to poll for messages while a controller commands the arm. The delay decreases, but the bridge
@@ -69,7 +67,7 @@ def run_bridge(
     from dvrk_drake.systems.ros.crtk_bridge import connect_bridge
 
     ready()  # threads of LCM and DDS inherit the scheduling of this thread
-    network, channel, problem = lcm.LCM(url), status_channel(arm), ""
+    network, channel, problem = lcm.LCM(driver.lcm_url), status_channel(arm), ""
 
     def send_status(data: bytes) -> None:
         # Without statuses, no command arrives, and the guard holds the arm.
@@ -79,7 +77,7 @@ def run_bridge(
             problem = ""
         except OSError as error:
             if not problem:
-                problem = f"LCM {url}: the status could not be sent: {error.strerror}"
+                problem = f"LCM {driver.lcm_url}: the status could not be sent: {error.strerror}"
                 report(problem)
 
     def send_force(force: lcmt_dvrk_force) -> None:

@@ -207,11 +207,9 @@ def calibrate(
             continue
         words = list(step.words)
         if step.moves:
-            words += connection
+            words += connection + ["--realtime"] * realtime + ["--reset"] * reset
             if transport == "ros" and "poses" in words:
                 words += ["--yes"]  # the dVRK moves the arm, after the question of this calibration
-            else:
-                words += ["--realtime"] * realtime + ["--reset"] * reset
             reset = False
         report(f"{header}: dvrk-drake {shlex.join(words)}")
         if step.moves:

@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from dvrk_drake.analysis.verdict import cross_validated_verdicts, unfit
+from dvrk_drake.dynamics.friction_compensation import Friction, holding_error, is_cross_validated
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.arm_schema import Gains
+from dvrk_drake.models.arm_schema import Gains, load_gains
 from dvrk_drake.models.lcm_messages import MessageKey, describe_state
 from dvrk_drake.processes.arm_operator import ArmObservation, observe, stop_arm
 from dvrk_drake.processes.arm_session import ArmSession, Dialog
@@ -118,8 +119,10 @@ class ArmConnection(ArmSession):
         self,
         controller: Mode | System = "gravity",
         *,
-        gains: Gains | None = None,
-        friction: FrictionCompensator | None = None,
+        gains: Gains | str | Path | None = None,
+        friction_ratio: float = 0.0,
+        hysteresis_ratio: float = 0.0,
+        friction_model: str | Path | None = None,
         report: Callable[[LiveStatus], None] = lambda status: None,
     ) -> None:
         """Controls the arm until `dialog.stopped` returns true. The arm then holds its pose.
@@ -127,14 +130,29 @@ class ArmConnection(ArmSession):
         Args:
             controller: Mode of a `GravityPidController`, or a System with an input port `state_estimated` (2n) and an
                 output port `effort` (n), for example with a period of 1 ms.
-            gains: Gains for all modes except "gravity". None: the gains of the arm.
-            friction: Friction compensator for the modes "gravity" and "guide". None: friction is not compensated.
+            gains: Gains for all modes except "gravity", or their file. None: the gains of the arm.
+            friction_ratio, hysteresis_ratio: Compensated shares of the friction in the modes "gravity" and "guide"; see
+                `FrictionCompensator`. They require a model that was identified from static poses.
+            friction_model: File of the model with the friction, identified from a motion. None: the model of this
+                connection.
             report: Function that is called with the live status a few times per second.
 
         Raises:
-            ControllerError: The arm cannot be controlled in its present state, or its guard holds it.
+            ControllerError: The arm cannot be controlled in its present state, its guard holds it, or gains or ratios
+                are not valid for the mode.
+            ModelError: The model contains no friction or belongs to another arm.
             DvrkDrakeError: The arm is not found on ROS 2, or another process could move it.
         """
+        if isinstance(gains, (str, Path)):
+            gains = self._load_gains(gains, controller)
+        friction = None
+        if friction_ratio or hysteresis_ratio:
+            friction = self._friction(controller, friction_ratio, hysteresis_ratio, friction_model)
+        if controller == "guide" and not is_cross_validated(self.model):
+            self.dialog.report(
+                "warning: the error of the model is unknown, because it was not identified from a recording; virtual "
+                "friction holds the arm only up to the dry friction of the arm file"
+            )
         made, link = self.start(controller, gains, friction)
         mode = f"mode {controller}" if isinstance(controller, str) else "control"
         self.dialog.report(f"{mode} of {self.arm.name} at {1 / made.period:.0f} Hz as sender {made.sender_id}")
@@ -219,6 +237,38 @@ class ArmConnection(ArmSession):
             DvrkDrakeError: A file is not valid; see also `run`.
         """
         return play_motion(self, path, output)
+
+    def _load_gains(self, path: str | Path, controller: Mode | System) -> Gains:
+        """Loads gains. Raises ControllerError if the mode uses none, or they are not valid for the arm."""
+        if controller == "gravity":
+            raise ControllerError(f"{path}: mode gravity does not use gains; allowed modes: damped, guide, hold")
+        gains = load_gains(path)
+        if fault := self.arm.gains_fault(gains):
+            raise ControllerError(f"{path}: {fault}")
+        return gains
+
+    def _friction(
+        self, controller: Mode | System, ratio: float, hysteresis_ratio: float, model: str | Path | None
+    ) -> FrictionCompensator:
+        """Returns the compensator for two ratios, and reports a reduced friction ratio. See `run` for errors."""
+        if controller not in ("gravity", "guide"):
+            raise ControllerError("a friction ratio or hysteresis ratio requires mode gravity or guide")
+        if self.model.provenance.method == "nominal":
+            raise ControllerError(
+                "a friction ratio or hysteresis ratio requires an identified model; with compensated friction, an "
+                "inaccurate gravity model makes the arm creep"
+            )
+        friction = Friction.of_model(self.model if model is None else IdentifiedModel.load(model, self.arm))
+        error = holding_error(self.model) if ratio else None
+        compensator = FrictionCompensator(friction, ratio=ratio, hysteresis_ratio=hysteresis_ratio, holding_error=error)
+        elements = zip(friction.effects, compensator.ratios, friction.springs_back, strict=True)
+        ratios = {e.coordinate: r for e, r, springs_back in elements if not springs_back}
+        if reduced := ", ".join(f"{name} {r:.2f}" for name, r in ratios.items() if r < 0.99 * ratio):
+            self.dialog.report(
+                "warning: the friction ratio is reduced, because friction must resist the error of the gravity model. "
+                f"Ratios: {reduced}"
+            )
+        return compensator
 
     def _observer(self) -> CrtkObserver:
         """Finds the arm on ROS 2. The caller closes the observer."""

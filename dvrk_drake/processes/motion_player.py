@@ -49,6 +49,7 @@ class PlayedMotion:
         path: File with the measurements, or with the rehearsal. None: nothing was written.
         tracking_error: Largest tracking error as a fraction of the range of a joint.
         is_complete: Whether the motion ended at its end.
+        recordings: Files with the recorded parts of the motion, without those that are too short for `identify`.
     """
 
     begin: float
@@ -57,6 +58,7 @@ class PlayedMotion:
     path: Path | None
     tracking_error: float
     is_complete: bool
+    recordings: tuple[Path, ...] = ()
 
 
 class MotionPlayer(ArmMover):
@@ -228,7 +230,7 @@ def play_motion(session: ArmSession, path: str | Path, output: str | Path | None
         parts = motion_parts.recorded_parts(output, arm, motion)
         rest, end = motion_parts.begin_of_rest(parts, motion.duration), motion.duration
         if rest is None:
-            return PlayedMotion(end, end, end, None, 0.0, True)
+            return PlayedMotion(end, end, end, None, 0.0, True, _recordings(parts, end))
         if not motion_parts.is_rehearsed(path, arm, motion):
             raise CollectionError(
                 f"{path}: the motion was not rehearsed on {arm.name}. First run: dvrk-drake collect motion "
@@ -268,4 +270,10 @@ def play_motion(session: ArmSession, path: str | Path, output: str | Path | None
         part = rehearsal.save(path)
     written = part if player.motion_time > begin and (is_complete or output is not None) else None
     largest = float((player.largest_error / span).max())
-    return PlayedMotion(begin, player.motion_time, motion.duration, written, largest, is_complete)
+    parts = [] if output is None else motion_parts.recorded_parts(output, arm, motion)
+    files = _recordings(parts, motion.duration)
+    return PlayedMotion(begin, player.motion_time, motion.duration, written, largest, is_complete, files)
+
+
+def _recordings(parts: list[motion_parts.MotionPart], duration: float) -> tuple[Path, ...]:
+    return tuple(part.path for part in motion_parts.useful(parts, duration))

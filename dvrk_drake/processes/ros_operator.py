@@ -128,7 +128,7 @@ def stop_dvrk(observer: CrtkObserver, *, power_off: bool = False) -> str:
         DvrkDrakeError: DDS cannot send a message.
     """
     name = observer.namespace
-    if not observer.stop(FIRST_WAIT):
+    if not observer.hold_until_confirmed(FIRST_WAIT):
         raise ControllerError(f"{name}: the arm did not confirm hold. Press the emergency stop button")
     if power_off and not observer.switch_power_off(_POWER_OFF):
         raise ControllerError(f"{name} holds its pose, but its power stays on. Press the emergency stop button")

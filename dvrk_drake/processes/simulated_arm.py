@@ -1,4 +1,4 @@
-"""Process that simulates one arm with an LCM interface, started by `dvrk-drake sim-arm`."""
+"""Processes that simulate one arm over LCM or ROS 2, started by `dvrk-drake sim-arm`."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import signal
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import lcm
 import numpy as np
@@ -26,6 +27,13 @@ from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.lcm_network import handle_message, listen
 from dvrk_drake.systems.lcm.sim_dvrk_driver import apply_driver_config
+from dvrk_drake.systems.ros.crtk_arm_state import CrtkCommand
+from dvrk_drake.systems.ros.crtk_driver import CrtkDriver
+from dvrk_drake.systems.ros.open_domain import open_ros_domain
+from dvrk_drake.systems.ros.sim_crtk_driver import PERIOD, apply_crtk_driver_config
+
+if TYPE_CHECKING:
+    from dvrk_drake.systems.ros.domain import RosDomain
 
 #: Length of the queue of commands. If the queue is full, further commands are dropped. Largest number of commands that
 #: are handled at the start of a tick. It limits the delay that a flood of messages can cause. Most commands are handled
@@ -34,6 +42,9 @@ _QUEUE, _MESSAGES_PER_STEP = 200, 10
 
 #: Largest effort that holds the default initial pose, as a share of the effort limits.
 _START_EFFORT = 0.6
+#: Time in which DDS discovers other processes [s]. Longest time until DDS considers a killed process as ended [s]; the
+#: default of Cyclone DDS is 10 s.
+_DISCOVERY, _ENDED = 1.0, 12.0
 
 
 def monotonic_utime() -> int:
@@ -101,7 +112,6 @@ class SimulatedArm:
         self,
         arm: Arm,
         driver: DvrkDriver,
-        url: str,
         q: ArrayLike,
         wall_clock: Callable[[], int] = monotonic_utime,
         *,
@@ -111,14 +121,13 @@ class SimulatedArm:
 
         Args:
             arm: Simulated arm.
-            driver: Configuration of the driver.
-            url: URL of the LCM network.
+            driver: Configuration of the driver, with the URL of the LCM network.
             q: Initial pose (n,) [rad, m].
             wall_clock: Function that returns a monotonic time [us]. The guard uses this function, so that commands also
                 expire while this process is late or suspended.
             effects: Simulated effects of the real arm. None: no effects.
         """
-        self.arm, self.driver, self._url = arm, driver, url
+        self.arm, self.driver = arm, driver
         self._ticks = 0
         self._status = b""
         self._memory = DrakeLcm("memq://")
@@ -143,7 +152,7 @@ class SimulatedArm:
     @property
     def source(self) -> str:
         """LCM network, for messages."""
-        return f"LCM {self._url}"
+        return f"LCM {self.driver.lcm_url}"
 
     @property
     def guard(self) -> CommandGuard:
@@ -187,7 +196,7 @@ class SimulatedArm:
         # LCM is opened here, because its receive thread inherits the scheduling of the thread that opens LCM. Drake's
         # subscription is not used, because it keeps only one message between two steps. The guard would then not detect
         # a second sender.
-        network = lcm.LCM(self._url)
+        network = lcm.LCM(self.driver.lcm_url)
         network.subscribe(command_channel(self.arm), self.receive).set_queue_capacity(_QUEUE)
         # The first measured period of the guard is too long, because it includes the time since the simulation was
         # created. The guard therefore refuses efforts in the first step. The status of this step is not published,
@@ -217,6 +226,92 @@ class SimulatedArm:
         guard = self.guard
         sender = f", sender {guard.sender_id}" if guard.sender_id else ""
         return describe_state(guard.state, guard.fault_text or guard.hold_reason) + sender
+
+
+class SimulatedRosArm:
+    """Simulated arm with the CRTK topics of a dVRK, stepped by the wall clock.
+
+    Attributes:
+        source: ROS domain and namespace of the topics, for messages.
+    """
+
+    def __init__(
+        self,
+        arm: Arm,
+        driver: CrtkDriver,
+        q: ArrayLike,
+        effects: ArmEffects | None = None,
+        *,
+        enabled: bool = False,
+    ) -> None:
+        """Creates the arm at rest, DISABLED and not homed.
+
+        Args:
+            arm: Simulated arm.
+            driver: Configuration of the driver.
+            q: Initial pose (n,) [rad, m].
+            effects: Simulated effects of the real arm. None: no effects.
+            enabled: Whether to enable and home the arm in the first step.
+
+        Raises:
+            DvrkDrakeError: The package cyclonedds is missing, or the domain cannot be used.
+            StationError: Another arm publishes in the namespace.
+            ModelError: The driver's model cannot be read, or is not valid for the arm.
+        """
+        self._report: Callable[[str], None] = lambda line: None
+        domain = open_ros_domain(driver.domain)
+        self.source = f"{domain.name}, topics {driver.arm_namespace(arm)}/..."
+        builder = DiagramBuilder()
+        station = builder.AddSystem(ArmStation(arm, effects=effects))
+        _refuse_other_arm(domain, f"{driver.arm_namespace(arm)}/measured_js")
+        sim_driver = apply_crtk_driver_config(driver, station, builder, domain=domain, report=self._report_with_time)
+        for text in ("enable", "home") if enabled else ():
+            sim_driver.Receive(CrtkCommand("state_command", text=text))
+        self._simulator = Simulator(builder.Build())
+        context = self._simulator.get_mutable_context()
+        station.SetPositions(station.GetMyMutableContextFromRoot(context), q)
+        self._ticks = 0
+
+    def step(self) -> None:
+        """Processes the received commands, publishes measurements and advances by one period."""
+        self._ticks += 1
+        self._simulator.AdvanceTo(self._ticks * PERIOD)
+
+    def run(
+        self,
+        stopped: Callable[[], bool],
+        report: Callable[[str], None] = lambda line: None,
+        enter: Callable[[], bool] = lambda: False,
+    ) -> Pace:
+        """Steps the simulation by the wall clock until `stopped` returns true.
+
+        Args:
+            stopped: Function that returns whether to stop. It is called once per tick.
+            report: Function that is called with a line of text on each change of state or mode and on refused commands.
+            enter: Not used, because a dVRK has no guard. `SimulatedArm.run` has this argument.
+
+        Returns:
+            Pace with the number of late ticks.
+        """
+        self._report = report
+        self._simulator.Initialize()
+        pace = Pace(PERIOD)
+        while not stopped():
+            pace.wait()
+            self.step()
+        return pace
+
+    def _report_with_time(self, line: str) -> None:
+        self._report(f"{self._simulator.get_context().get_time():9.3f} s  {line}")
+
+
+def _refuse_other_arm(domain: RosDomain, topic: str) -> None:
+    """Raises StationError if another process publishes `topic`. Clients would receive the measurements of both arms."""
+    domain.wait_until(lambda: False, _DISCOVERY)
+    if not domain.wait_until(lambda: topic not in domain.joint_state_topics(), _ENDED):
+        raise StationError(
+            f"another arm publishes {topic} in {domain.name}. End it, or choose another --topic or --domain"
+        )
 
 
 def stop_on_signals() -> Callable[[], bool]:

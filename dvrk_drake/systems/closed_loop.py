@@ -7,6 +7,7 @@ from pydrake.systems.framework import DiagramBuilder, System
 from dvrk_drake.errors import StationError
 from dvrk_drake.systems.arm_drive import ArmDrive
 from dvrk_drake.systems.arm_station import ArmStation
+from dvrk_drake.systems.effort_ramp import EffortRamp
 from dvrk_drake.systems.friction_compensator import FrictionCompensator
 from dvrk_drake.systems.hardware_arm_station import HardwareArmStation
 from dvrk_drake.systems.station import Station
@@ -19,6 +20,7 @@ def add_closed_loop(
     desired: System | None = None,
     friction: FrictionCompensator | None = None,
     *,
+    ramp: EffortRamp | None = None,
     name: str = "",
 ) -> None:
     """Adds a station and its controller to a Diagram and connects them.
@@ -30,6 +32,7 @@ def add_closed_loop(
             `state_estimated` (2n) and an output port `effort` (n).
         desired: System with one output port (2n): q_d, then v_d. None: the controller regulates the initial pose.
         friction: Compensator for a share of the arm's friction. None: friction is not compensated.
+        ramp: Ramp from the measured efforts of a real arm to those of the controller. None: there is no ramp.
         name: Name of the arm in a `Station`.
 
     Raises:
@@ -68,6 +71,12 @@ def add_closed_loop(
         builder.Connect(state, friction.GetInputPort("state_estimated"))
         builder.Connect(effort, friction.GetInputPort("effort_wanted"))
         effort = friction.GetOutputPort("effort")
+    if ramp is not None and not isinstance(station, ArmDrive):
+        builder.AddSystem(ramp)
+        builder.Connect(effort, ramp.GetInputPort("effort_wanted"))
+        for port, measured in (("effort_measured", "effort_measured"), ("enabled", "in_control")):
+            builder.Connect(station.GetOutputPort(f"{name}.{measured}"), ramp.GetInputPort(port))
+        effort = ramp.GetOutputPort("effort")
     builder.Connect(effort, commanded)
     if desired is not None:
         builder.AddSystem(desired)

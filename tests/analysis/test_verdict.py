@@ -246,15 +246,15 @@ def test_saved_verdicts_include_all_joints(truth, tmp_path):
 
 def test_commands_warn_before_connecting_to_the_arm(files, capsys):
     """`connect_arm` is shared by control and collect. It does not open the network."""
-    from dvrk_drake.cli.app import ControlledArm
     from dvrk_drake.cli.control import connect_arm
+    from dvrk_drake.cli.options import ControlledArm
 
     model, _, bad = files
     assert main(["validate", bad, "--model", model, "--save"]) == 0
     capsys.readouterr()
     for path, warnings in ((model, 1), (None, 0)):
-        assert connect_arm(ControlledArm(arm="mtmr", model=path), Dialog()).arm.name == "MTMR"
-        assert capsys.readouterr().err.count("shoulder_pitch (do not use)") == warnings
+        assert connect_arm(ControlledArm(arm="mtmr", model=path), Dialog(report=print)).arm.name == "MTMR"
+        assert capsys.readouterr().out.count("shoulder_pitch (do not use)") == warnings
 
 
 def test_cross_validated_verdicts_use_the_same_rule(truth):

@@ -10,7 +10,7 @@ import pytest
 from command_output import refusal
 
 from dvrk_drake.cli import main
-from dvrk_drake.cli.app import FileOptions, app
+from dvrk_drake.cli.options import FileOptions, app
 from dvrk_drake.errors import RecordingError
 
 COMMANDS = [name for name in app if not name.startswith("-")]

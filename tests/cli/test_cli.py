@@ -207,7 +207,7 @@ WRITE_A_FILE = [
     "simulate --arm mtml --output",
     "simulate tune --arm mtml --output",
     "simulate transparency --arm mtml --output",
-    "teleop --output",
+    "simulate teleop --output",
     "keygen --output",
     "record --arm mtml --lcm-url memq://",
 ]

@@ -9,8 +9,7 @@ from repository import ROOT
 from robot_file import write_robot
 
 from dvrk_drake.cli import main
-from dvrk_drake.cli.app import app
-from dvrk_drake.cli.program import COMMANDS  # noqa: F401  (adds the commands)
+from dvrk_drake.cli.program import app
 from dvrk_drake.models.arm_files import load_arm
 
 

@@ -371,9 +371,7 @@ def test_commands_reject_invalid_options(tmp_path, capsys):
     assert "gains.kp has 1 number; allowed: 7" in error_line(
         capsys, "simulate", "--arm", "mtml", "--set", f"controller.gains={few}"
     )
-    assert "requires --mode damped, guide or hold" in error_line(
-        capsys, "control", "--arm", "mtml", "--gains", str(few)
-    )
+    assert "mode gravity does not use gains" in error_line(capsys, "control", "--arm", "mtml", "--gains", str(few))
 
 
 @pytest.mark.slow

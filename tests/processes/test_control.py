@@ -18,6 +18,8 @@ from dvrk_drake.models import files
 from dvrk_drake.models.lcm_messages import MessageKey, describe_refusal, status_channel
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.arm_operator import reset_fault
+from dvrk_drake.processes.arm_session import Dialog
+from dvrk_drake.processes.connection import connect
 from dvrk_drake.processes.control import control, first_status
 from dvrk_drake.processes.live_status import LiveStatus, LiveStatusMaker
 from dvrk_drake.processes.teacher import Teacher
@@ -184,27 +186,14 @@ def test_control_applies_efforts_reports_and_releases(controller):
     assert link.guard.state == Status.STATE_HOLD and link.commands[-1].control_mode == Command.HOLD
 
 
-def test_springs_of_guide_detach_during_a_watchdog_hold():
-    # Over LCM and ROS 2, the same controller answers the statuses.
-    link, guide = GuardedArm(), ArmController(ARM, IdentifiedModel.from_arm(ARM), "guide", 1e-3)
-    modes, efforts = [], []
-    for k in range(1200):
-        if k == 1000:
-            pause_controller(link, 0.2)  # the commands expire
-        link.status.position = list(np.array(link.status.position) + (5e-6 if 700 < k < 900 else 0.0))
-        link.send(guide.answer(link.next_status(1.0), link.now()))
-        modes.append(guide._controller.GetMode(guide._controller_context))
-        efforts.append(link.commands[-1].effort)
-    assert modes[999] == "guide" and modes[1001] == "gravity"
-    assert np.abs(np.array(efforts[999]) - efforts[650]).max() > 1e-3  # the springs are deflected
-    np.testing.assert_allclose(efforts[1001], link.status.effort_measured, atol=1e-12)
-
-
-def test_guide_warns_about_a_model_without_validation(monkeypatch, capsys):
-    connection = SimpleNamespace(model=IdentifiedModel.from_arm(ARM), arm=ARM, run=lambda *args, **options: None)
-    monkeypatch.setattr("dvrk_drake.cli.control.connect_arm", lambda controlled, dialog, **settings: connection)
-    assert main(["control", "--arm", "mtml", "--mode", "guide"]) == 0
-    assert capsys.readouterr().err.count("warning: the error of the model at rest is unknown") == 1
+def test_guide_warns_about_a_model_without_validation(monkeypatch):
+    lines = []
+    connection = connect(ARM, lcm_url="memq://", dialog=Dialog(report=lines.append))
+    made = SimpleNamespace(period=1e-3, sender_id=7)
+    monkeypatch.setattr(connection, "start", lambda mode, gains, friction: (made, None))
+    monkeypatch.setattr(connection, "control", lambda *arguments, **options: None)
+    connection.run("guide")
+    assert "warning: the error of the model is unknown" in lines[0] and len(lines) == 2
 
 
 def test_live_status_describes_new_refusals():
@@ -221,7 +210,10 @@ def test_live_status_describes_new_refusals():
     assert not maker.make(status, 0.4, 0).problem
 
 
-def test_run_prints_each_change_once(controller, monkeypatch, capsys):
+@pytest.mark.parametrize("transport", ["lcm", "ros"])
+def test_run_prints_each_change_once(transport, controller, monkeypatch, capsys):
+    """Over ROS 2, the guard in this process prints the changes of its state."""
+
     def control(link, controller, stopped, report, on_status):
         for state, pace, problem in [
             ("hold", "1 Hz", ""),
@@ -234,18 +226,19 @@ def test_run_prints_each_change_once(controller, monkeypatch, capsys):
     monkeypatch.setattr("dvrk_drake.processes.arm_session.ArmSession.start", lambda *_: (controller, link))
     monkeypatch.setattr("dvrk_drake.processes.arm_session.control", control)
     monkeypatch.setattr("dvrk_drake.processes.simulated_arm.stop_on_signals", lambda: None)
-    assert main(["control", "--arm", "mtml", "--reset"]) == 0
+    assert main(["control", "--arm", "mtml", "--transport", transport]) == 0
     output = capsys.readouterr()
-    assert output.out.splitlines()[1:-1] == ["hold; 1 Hz", "hold; 3 Hz; refused: stale"] * 2
+    lines = ["hold; 1 Hz", "hold; 3 Hz; refused: stale"] * 2
+    assert output.out.splitlines()[1:-1] == (lines if transport == "lcm" else lines[1:])
     assert not output.err
 
 
-def test_friction_requires_holding_error(tmp_path, capsys):
+def test_friction_requires_an_identified_model(tmp_path, capsys):
     path = str(tmp_path / "model.yaml")
     IdentifiedModel.from_arm(ARM).save(path)
     assert main(["control", "--arm", "mtml", "--model", path, "--friction-ratio", "0.5"]) == 2
     said = capsys.readouterr().err
-    assert "friction compensation requires a model identified from static poses" in said and said.count("\n") == 1
+    assert "hysteresis ratio requires an identified model" in said and said.count("\n") == 1
 
 
 def test_live_status_has_rate_and_round_trip():

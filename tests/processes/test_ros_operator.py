@@ -50,7 +50,7 @@ class Observed:
     def other_publishers(self):
         return self.others
 
-    def stop(self, seconds):
+    def hold_until_confirmed(self, seconds):
         return self.confirms
 
     def switch_power_off(self, seconds):

@@ -12,8 +12,8 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.simulated_arm import SimulatedArm
-from dvrk_drake.systems.lcm.dvrk_command import DvrkCommandReceiver
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.lcm.sim_dvrk_driver import DvrkArmServer
 
 STALLS = pytest.mark.parametrize("seconds", [0.02, 0.05, 0.2, 1.0])
 #: Largest motion of an arm at rest, from the beginning of a stall until 0.5 s after it [rad, m].
@@ -32,11 +32,9 @@ class Loop:
         arm = load_arm(name)
         self.wall, self.time, self.motion_time, self.status = 10**9, 0.0, 0.0, Status()
         self.is_bridge_stopped = False
-        methods = {
-            name: self.unless_stopped(getattr(DvrkCommandReceiver, name)) for name in ("_update", "_store_effort")
-        }
-        with mock.patch.multiple(DvrkCommandReceiver, **methods):
-            self.arm = SimulatedArm(arm, DvrkDriver(), "memq://", POSES[name], wall_clock=lambda: self.wall)
+        methods = {name: self.unless_stopped(getattr(DvrkArmServer, name)) for name in ("_update", "_store_effort")}
+        with mock.patch.multiple(DvrkArmServer, **methods):
+            self.arm = SimulatedArm(arm, DvrkDriver(lcm_url="memq://"), POSES[name], wall_clock=lambda: self.wall)
         self.controller = ArmController(arm, IdentifiedModel.from_arm(arm), "hold", 1e-3)
         self.velocity = speed * np.eye(arm.num_joints)[0]
         self.moved = []

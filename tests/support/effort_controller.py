@@ -14,7 +14,7 @@ import lcm
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.lcm_messages import command_channel, status_channel
-from dvrk_drake.systems.lcm.dvrk_command import draw_id
+from dvrk_drake.systems.lcm.messages import draw_id
 
 #: Driver configuration for an arm without dynamics: it measures no effort, although gravity acts on its model.
 #: The timeouts are long, so that a busy computer does not end the commands.

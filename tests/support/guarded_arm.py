@@ -4,7 +4,7 @@ from guard_bench import ARM, LIMIT, SESSION, N, Q, Weightless
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.systems.guard.command_guard import CommandGuard
-from dvrk_drake.systems.lcm.dvrk_status import fill_in_guard
+from dvrk_drake.systems.lcm.messages import fill_in_guard
 
 
 class GuardedArm:

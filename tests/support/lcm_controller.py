@@ -15,7 +15,7 @@ from effort_controller import effort_command
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes.pace import make_realtime
-from dvrk_drake.systems.lcm.dvrk_command import draw_id
+from dvrk_drake.systems.lcm.messages import draw_id
 
 
 class Controller:

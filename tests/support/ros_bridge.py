@@ -9,7 +9,7 @@ from waiting import wait_until
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
-from dvrk_drake.systems.lcm.dvrk_command import draw_id
+from dvrk_drake.systems.lcm.messages import draw_id
 
 
 def start_bridge(arm, folder, *options):

@@ -12,7 +12,7 @@ from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.collector import CollectionSettings, Collector
 from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.guard.settings import GuardSettings
-from dvrk_drake.systems.lcm.dvrk_status import fill_in_guard
+from dvrk_drake.systems.lcm.messages import fill_in_guard
 
 PERIOD = 1e-3
 

@@ -33,7 +33,7 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.lcm_messages import create_key_file
 from dvrk_drake.processes.pace import Pace, make_realtime
-from dvrk_drake.systems.lcm.dvrk_command import draw_id
+from dvrk_drake.systems.lcm.messages import draw_id
 
 pytestmark = [pytest.mark.network, pytest.mark.realtime]
 

@@ -27,7 +27,6 @@ from pydrake.visualization import AddFrameTriadIllustration
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import add_arm, main_frames, set_arm_positions
-from dvrk_drake.systems.arm_view.visibility import Visibility
 
 #: Colour of a ghost at the commanded pose: that of commanded values in plots.
 COMMANDED = Rgba(0.47, 0.016, 0.467, 0.5)
@@ -37,6 +36,36 @@ ENLARGEMENT = 1.01
 SAME_POSITION, SAME_ANGLE = 1e-3, 0.01
 #: Ratio of the radius of the axes of a frame to their length.
 _AXIS_RADIUS = 0.04
+
+
+class Visibility:
+    """Shows and hides objects. Only changes are sent."""
+
+    def __init__(self, meshcat: Meshcat) -> None:
+        """Starts with all objects as they are."""
+        self._meshcat = meshcat
+        self._visible: dict[str, bool] = {}
+        self._recorded: set[str] = set()
+
+    def set(self, path: str, visible: bool, time: float | None = None) -> None:
+        """Shows or hides the object at a path. A recording stores the change at `time` [s]."""
+        before = self._visible.get(path)
+        if before == visible:
+            return
+        self._visible[path] = visible
+        if time is not None and path not in self._recorded:
+            # An animation uses its first value also for earlier times.
+            self._recorded.add(path)
+            self._meshcat.SetProperty(path, "visible", before is not False, 0.0)
+        self._meshcat.SetProperty(path, "visible", visible, time)
+
+    def end_recording(self, time: float) -> None:
+        """Stores the last state of all recorded objects at the end of a recording [s].
+
+        Otherwise the track of each object ends at its last change, and each track repeats alone.
+        """
+        for path in self._recorded:
+            self._meshcat.SetProperty(path, "visible", self._visible[path], time)
 
 
 class DrawnArm:

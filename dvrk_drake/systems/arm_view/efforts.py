@@ -12,7 +12,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context
 
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.systems.arm_view.visibility import Visibility
+from dvrk_drake.systems.arm_view.drawn_arm import Visibility
 
 #: Shares of the effort limit that are drawn, and angle of an arc at the effort limit [rad].
 LEVELS = (0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)

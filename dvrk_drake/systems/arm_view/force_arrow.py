@@ -10,7 +10,7 @@ from pydrake.geometry import Cylinder, Meshcat, MeshcatCone, Rgba, Sphere
 from pydrake.math import RigidTransform, RotationMatrix
 
 from dvrk_drake.dynamics.contact import MAX_DEVIATION
-from dvrk_drake.systems.arm_view.visibility import Visibility
+from dvrk_drake.systems.arm_view.drawn_arm import Visibility
 
 #: Length of the arrow [m/N]. 10 N are a quarter of the length of a PSM.
 LENGTH = 0.02

@@ -22,35 +22,21 @@ _MODES = {
 
 
 @dataclass
-class DvrkDriver:
-    """Configuration of the driver of one arm, comparable to Drake's IiwaDriver.
+class ArmDriver:
+    """Configuration of the driver of one arm that does not depend on the transport.
 
     Attributes:
-        lcm_url: URL of the LCM network. If it is empty, the environment variable LCM_DEFAULT_URL or LCM's default is
-            used.
-        status_period: Period in which the arm sends statuses and a controller sends commands [s].
-        control_modes: Modes that the arm accepts in addition to hold: position, effort and "off". Write "off" in
+        control_modes: Modes that the guard accepts in addition to hold: position, effort and "off". Write "off" in
             quotes, because YAML reads off as false. "off" is not accepted by default, because an arm falls when its
             motors are off.
-        key_file: File with the key that signs commands and statuses, created by `dvrk-drake keygen`. The path is
-            relative to the driver's YAML file. If it is empty, messages are not authenticated, and any process on the
-            network can command the arm.
         gravity_compensation: If true, the arm adds its own gravity compensation to commanded efforts (an option of a
             dVRK).
-        model: File of the identified model with which the guard checks measurements. The path is relative to the
-            driver's YAML file. If it is empty, the model of the arm's SDF is used.
+        model: File of the identified model of the arm, with which the guard checks measurements. The path is relative
+            to the driver's YAML file. If it is empty, the model of the arm's SDF is used.
         guard: Settings of the command guard.
-
-    Example:
-        >>> import dvrk_drake as dvrk
-        >>> driver = dvrk.DvrkDriver(control_modes=["effort"], lcm_url="memq://")  # messages within this process
-        >>> station = dvrk.HardwareArmStation(dvrk.load_arm("mtml"), driver=driver)
     """
 
-    lcm_url: str = ""
-    status_period: float = field(default=1e-3, metadata=within(0.0005, 0.01, "s"))
     control_modes: list[str] = field(default_factory=lambda: ["position", "effort"])
-    key_file: str = ""
     gravity_compensation: bool = False
     model: str = ""
     guard: GuardSettings = field(default_factory=GuardSettings)
@@ -62,7 +48,7 @@ class DvrkDriver:
         """Checks the values. Call this method again if fields are set later, as yaml_load_typed does.
 
         Raises:
-            StationError: A control mode is unknown, the period is out of range, or a setting of the guard is invalid.
+            StationError: A control mode is unknown, a number is out of range, or a setting of the guard is invalid.
         """
         self.guard.check()
         if any(mode not in _MODES for mode in self.control_modes):
@@ -73,20 +59,9 @@ class DvrkDriver:
             raise StationError(fault)
 
     def relative_to(self, folder: Path) -> None:
-        """Resolves relative paths in `key_file` and `model` against `folder`."""
-        if self.key_file:
-            self.key_file = str(folder / self.key_file)
+        """Resolves a relative path in `model` against `folder`."""
         if self.model:
             self.model = str(folder / self.model)
-
-    def warnings(self) -> list[str]:
-        """Returns a line each on weaker guard settings than the defaults, and on an arm that compensates gravity."""
-        lines = []
-        if weaker := self.guard.weaker_than_default():
-            lines.append(f"the guard protects the arm less than with its default settings: {weaker}")
-        if self.gravity_compensation:
-            lines.append("the arm adds its own gravity compensation to commanded efforts (gravity_compensation: true)")
-        return lines
 
     def load_model(self, arm: Arm) -> IdentifiedModel | None:
         """Returns the model in the file `model`, or None if `model` is empty.
@@ -97,13 +72,56 @@ class DvrkDriver:
         return IdentifiedModel.load(self.model, arm) if self.model else None
 
     def load_key(self) -> MessageKey | None:
+        """Returns None: messages are not signed."""
+        return None
+
+    def accepted_modes(self) -> tuple[int, ...]:
+        """Returns `control_modes` as values of lcmt_dvrk_command.control_mode."""
+        return tuple(_MODES[mode] for mode in self.control_modes)
+
+
+@dataclass
+class DvrkDriver(ArmDriver):
+    """Configuration of the driver of one arm over LCM, comparable to Drake's IiwaDriver.
+
+    Attributes:
+        lcm_url: URL of the LCM network. If it is empty, the environment variable LCM_DEFAULT_URL or LCM's default is
+            used.
+        status_period: Period in which the arm sends statuses and a controller sends commands [s].
+        key_file: File with the key that signs commands and statuses, created by `dvrk-drake keygen`. The path is
+            relative to the driver's YAML file. If it is empty, messages are not authenticated, and any process on the
+            network can command the arm.
+        control_modes, gravity_compensation, model, guard: See `ArmDriver`.
+
+    Example:
+        >>> import dvrk_drake as dvrk
+        >>> driver = dvrk.DvrkDriver(control_modes=["effort"], lcm_url="memq://")  # messages within this process
+        >>> station = dvrk.HardwareArmStation(dvrk.load_arm("mtml"), driver=driver)
+    """
+
+    lcm_url: str = ""
+    status_period: float = field(default=1e-3, metadata=within(0.0005, 0.01, "s"))
+    key_file: str = ""
+
+    def relative_to(self, folder: Path) -> None:
+        """Resolves relative paths in `key_file` and `model` against `folder`."""
+        super().relative_to(folder)
+        if self.key_file:
+            self.key_file = str(folder / self.key_file)
+
+    def warnings(self) -> list[str]:
+        """Returns a line each on weaker guard settings than the defaults, and on an arm that compensates gravity."""
+        lines = []
+        if weaker := self.guard.weaker_than_default():
+            lines.append(f"the guard protects the arm less than with its default settings: {weaker}")
+        if self.gravity_compensation:
+            lines.append("the arm adds its own gravity compensation to commanded efforts (gravity_compensation: true)")
+        return lines
+
+    def load_key(self) -> MessageKey | None:
         """Returns the key in `key_file`, or None if `key_file` is empty.
 
         Raises:
             KeyFileError: The key cannot be used; see `MessageKey.load`.
         """
         return MessageKey.load(self.key_file) if self.key_file else None
-
-    def accepted_modes(self) -> tuple[int, ...]:
-        """Returns `control_modes` as values of lcmt_dvrk_command.control_mode."""
-        return tuple(_MODES[mode] for mode in self.control_modes)

@@ -14,9 +14,8 @@ from dvrk_drake.models.lcm_messages import describe_state
 from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.guard.command_inbox import CommandInbox
 from dvrk_drake.systems.guard.follower import GuardOutput
-from dvrk_drake.systems.lcm.dvrk_command import draw_id
-from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
-from dvrk_drake.systems.lcm.dvrk_status import fill_in_guard
+from dvrk_drake.systems.lcm.dvrk_driver import ArmDriver
+from dvrk_drake.systems.lcm.messages import draw_id, fill_in_guard
 from dvrk_drake.systems.ros.arrival_clock import ArrivalClock
 from dvrk_drake.systems.ros.crtk_client import CrtkClient, connect_client
 from dvrk_drake.systems.ros.deadman import DeadmanProcess, describe_priority
@@ -71,7 +70,7 @@ class CrtkBridge:
     def __init__(
         self,
         client: CrtkClient,
-        driver: DvrkDriver,
+        driver: ArmDriver,
         send_status: Callable[[bytes], None],
         *,
         report: Callable[[str], None] = lambda line: None,
@@ -388,7 +387,7 @@ class CrtkBridge:
 
 def connect_bridge(
     arm: Arm,
-    driver: DvrkDriver,
+    driver: ArmDriver,
     send_status: Callable[[bytes], None],
     *,
     topic: str | None = None,

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -139,14 +140,6 @@ class CrtkObserver:
         """Returns the topics on which another process of the domain could move the arm, see `other_publishers`."""
         return other_publishers(self.domain, self.arm, self.namespace)
 
-    def stop(self, seconds: float) -> bool:
-        """Publishes `hold` until the arm has confirmed it, at most `seconds` [s]. Returns whether it has.
-
-        Raises:
-            DvrkDrakeError: DDS cannot send the message.
-        """
-        return self._hold_until_confirmed(self.domain.advertise(self._topic("hold"), Empty), seconds)
-
     def switch_power_off(self, seconds: float) -> bool:
         """Sends "disable" until the motors have no power, at most `seconds` [s]. Returns whether they have none.
 
@@ -155,7 +148,6 @@ class CrtkObserver:
         Raises:
             DvrkDrakeError: DDS cannot send the message.
         """
-        command = self.domain.advertise(self._topic("state_command"), StringStamped)
         end = time.monotonic() + seconds
 
         def is_off() -> bool:
@@ -163,19 +155,41 @@ class CrtkObserver:
             return self.operating_state is not None and self.operating_state.state in ("DISABLED", "FAULT")
 
         while not is_off() and time.monotonic() < end:
-            command.publish(StringStamped(Header.now(), "disable"))
+            self.state_command("disable")
             self.domain.wait_until(is_off, _REPEAT)
         return is_off()
 
-    def _hold_until_confirmed(self, hold: Publisher[Empty], seconds: float) -> bool:
+    def hold(self) -> None:
+        """Commands the arm to hold its present pose. The set-point is the pose at which the message arrives."""
+        self._hold.publish(Empty())
+
+    def state_command(self, command: str) -> None:
+        """Sends a command such as "enable", "home" or "disable" to the state machine of the arm."""
+        self._state_command.publish(StringStamped(Header.now(), command))
+
+    def hold_until_confirmed(self, seconds: float) -> bool:
+        """Publishes `hold` until the arm has confirmed it, at most `seconds` [s]. Returns whether it has.
+
+        Raises:
+            DvrkDrakeError: DDS cannot send the message.
+        """
         end = time.monotonic() + seconds
 
         def attempt(longest: float) -> bool:
-            hold.publish(Empty())
-            is_received = hold.wait_until_received(longest)
-            return is_received and bool(self._state.publisher_participants() & hold.subscriber_participants())
+            self.hold()
+            is_received = self._hold.wait_until_received(longest)
+            return is_received and bool(self._state.publisher_participants() & self._hold.subscriber_participants())
 
         return repeat_until_confirmed(attempt, lambda: time.monotonic() >= end)
+
+    @cached_property
+    def _hold(self) -> Publisher[Empty]:
+        """Publisher of `hold`, which an observer creates only if it stops the arm."""
+        return self.domain.advertise(self._topic("hold"), Empty)
+
+    @cached_property
+    def _state_command(self) -> Publisher[StringStamped]:
+        return self.domain.advertise(self._topic("state_command"), StringStamped)
 
     def _subscribe_to_state(self) -> Subscription[OperatingState]:
         return self.domain.subscribe(self._topic("operating_state"), OperatingState, depth=100, latched=True)
@@ -195,16 +209,16 @@ class CrtkClient(CrtkObserver):
         super().__init__(domain, arm, namespace, polled=polled)
         self._separate = arm.joint_names.index(arm.separate_joint) if arm.separate_joint else None
         self._other_hold = domain.subscribe(self._topic("hold"), Empty, ignore_own=True, wakes=False)
-        self._servo_jp = self._advertise("servo_jp")
-        self._servo_jf = self._advertise("servo_jf")
-        self._move_jp = self._advertise("move_jp")
+        # DDS needs time to connect a new publisher to the arm, so all are created now.
+        self._commands: dict[str, Publisher] = {
+            name: domain.advertise(self._topic(name), JointState) for name in ("servo_jp", "servo_jf", "move_jp")
+        }
+        self._commands |= {"hold": self._hold, "state_command": self._state_command}
         if self._separate is not None:
             self._jaw_commands = {
                 name: domain.advertise(self._jaw_topic(name), JointState) for name in _SEPARATE_TOPICS
             }
-        self._hold = domain.advertise(self._topic("hold"), Empty)
         self._use_gravity_compensation = domain.advertise(self._topic("use_gravity_compensation"), Bool)
-        self._state_command = domain.advertise(self._topic("state_command"), StringStamped)
 
     def take_other_hold(self) -> bool:
         """Returns whether another process has published `hold` since the last call."""
@@ -216,7 +230,8 @@ class CrtkClient(CrtkObserver):
         Raises:
             DvrkDrakeError: There are not n finite efforts, or DDS cannot send the message.
         """
-        self._servo_jf.publish(JointState(Header.now(), effort=self._main(self._checked("servo_jf", effort))))
+        message = JointState(Header.now(), effort=self._main(self._checked("servo_jf", effort)))
+        self._commands["servo_jf"].publish(message)
 
     def servo_jp(self, q: ArrayLike, v: ArrayLike | None = None) -> None:
         """Commands positions q (n,) [rad, m] and feedforward velocities v (n,) [rad/s, m/s], without a trajectory.
@@ -226,7 +241,7 @@ class CrtkClient(CrtkObserver):
         Raises:
             DvrkDrakeError: There are not n finite numbers each, or DDS cannot send the message.
         """
-        self._servo_jp.publish(self._position_command("servo_jp", q, v))
+        self._commands["servo_jp"].publish(self._position_command("servo_jp", q, v))
 
     def move_jp(self, q: ArrayLike) -> None:
         """Commands a motion to q (n,) [rad, m], with the separate joint. The arm computes the trajectory.
@@ -234,7 +249,7 @@ class CrtkClient(CrtkObserver):
         Raises:
             DvrkDrakeError: There are not n finite positions, or DDS cannot send a message.
         """
-        self._move_jp.publish(self._position_command("move_jp", q, None))
+        self._commands["move_jp"].publish(self._position_command("move_jp", q, None))
         if self._separate is not None:
             self.servo_separate("move_jp", float(np.asarray(q)[self._separate]))
 
@@ -254,25 +269,9 @@ class CrtkClient(CrtkObserver):
         setattr(message, "effort" if name == "servo_jf" else "position", [float(value)])
         self._jaw_commands[name].publish(message)
 
-    def hold(self) -> None:
-        """Commands the arm to hold its present pose. The set-point is the pose at which the message arrives."""
-        self._hold.publish(Empty())
-
     def use_gravity_compensation(self, on: bool) -> None:
         """Switches the dVRK's own gravity compensation on or off."""
         self._use_gravity_compensation.publish(Bool(on))
-
-    def state_command(self, command: str) -> None:
-        """Sends a command such as "enable", "home" or "disable" to the state machine of the arm."""
-        self._state_command.publish(StringStamped(Header.now(), command))
-
-    def hold_until_confirmed(self, seconds: float) -> bool:
-        """Publishes `hold` until the arm has confirmed it, at most `seconds` [s]. Returns whether it has.
-
-        Raises:
-            DvrkDrakeError: DDS cannot send the message.
-        """
-        return self._hold_until_confirmed(self._hold, seconds)
 
     def unheard_commands(self, names: Sequence[str]) -> list[str]:
         """Returns the command topics to which the DDS participant that publishes operating_state does not subscribe.
@@ -280,14 +279,8 @@ class CrtkClient(CrtkObserver):
         Args:
             names: Names of the commands to check: servo_jp, servo_jf, move_jp or hold.
         """
-        publishers: dict[str, Publisher] = {
-            "servo_jp": self._servo_jp,
-            "servo_jf": self._servo_jf,
-            "move_jp": self._move_jp,
-            "hold": self._hold,
-        }
-        arm = self._state.publisher_participants()
-        return [publishers[name].topic for name in names if not arm & publishers[name].subscriber_participants()]
+        arm, publishers = self._state.publisher_participants(), [self._commands[name] for name in names]
+        return [publisher.topic for publisher in publishers if not arm & publisher.subscriber_participants()]
 
     def _position_command(self, name: str, q: ArrayLike, v: ArrayLike | None) -> JointState:
         message = JointState(Header.now(), position=self._main(self._checked(name, q)))
@@ -312,9 +305,6 @@ class CrtkClient(CrtkObserver):
         if self._separate is not None:
             del numbers[self._separate]
         return numbers
-
-    def _advertise(self, name: str) -> Publisher[JointState]:
-        return self.domain.advertise(self._topic(name), JointState)
 
 
 def other_publishers(domain: RosDomain, arm: Arm, namespace: str) -> list[str]:

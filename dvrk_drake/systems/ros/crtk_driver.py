@@ -6,19 +6,16 @@ This file has no postponed annotations, because yaml_load_typed reads the types 
 """
 
 from dataclasses import dataclass, field
-from pathlib import Path
 
-from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.ranges import number_fault, within
-from dvrk_drake.systems.guard.settings import GuardSettings
-from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+from dvrk_drake.models.ranges import within
+from dvrk_drake.systems.lcm.dvrk_driver import ArmDriver
 from dvrk_drake.systems.ros.discovery import topic_fault
 
 
 @dataclass
-class CrtkDriver:
+class CrtkDriver(ArmDriver):
     """Configuration of the driver of one arm over ROS 2, comparable to `DvrkDriver` over LCM.
 
     Attributes:
@@ -28,10 +25,7 @@ class CrtkDriver:
         rate: Rate of the measurements of a simulated arm [Hz].
         gravity_compensation: If true, a simulated arm adds its own gravity compensation to commanded efforts. The topic
             `use_gravity_compensation` changes this setting. The bridge switches it off on a real arm.
-        model: File of the identified model of the arm. The path is relative to the driver's YAML file. If it is empty,
-            the model of the arm's SDF is used.
-        control_modes: Modes that the guard of a real arm accepts in addition to hold; see `DvrkDriver`.
-        guard: Settings of the command guard of a real arm.
+        control_modes, model, guard: See `ArmDriver`. The modes and the guard are those of a real arm.
 
     Example:
         >>> import dvrk_drake as dvrk
@@ -42,42 +36,16 @@ class CrtkDriver:
     domain: int | None = field(default=None, metadata=within(0, 232))
     namespace: str = ""
     rate: float = field(default=1000.0, metadata=within(10.0, 1000.0, "Hz"))
-    gravity_compensation: bool = False
-    model: str = ""
-    control_modes: list[str] = field(default_factory=lambda: ["position", "effort"])
-    guard: GuardSettings = field(default_factory=GuardSettings)
-
-    def __post_init__(self) -> None:
-        self.check()
 
     def check(self) -> None:
         """Checks the values. Call this method again if fields are set later, as yaml_load_typed does.
 
         Raises:
-            StationError: A value is out of range, or the namespace is not valid in ROS 2.
+            StationError: A value is not allowed, or the namespace is not valid in ROS 2.
         """
-        if fault := number_fault(self):
-            raise StationError(fault)
-        self.guard_driver().check()
+        super().check()
         if self.namespace.strip("/") and (fault := topic_fault(self.namespace)):
             raise StationError(f"namespace {fault}")
-
-    def relative_to(self, folder: Path) -> None:
-        """Resolves a relative path in `model` against `folder`."""
-        if self.model:
-            self.model = str(folder / self.model)
-
-    def load_model(self, arm: Arm) -> IdentifiedModel | None:
-        """Returns the model in the file `model`, or None if `model` is empty.
-
-        Raises:
-            ModelError: The file cannot be read, or the model is not valid for `arm`.
-        """
-        return IdentifiedModel.load(self.model, arm) if self.model else None
-
-    def guard_driver(self) -> DvrkDriver:
-        """Returns the configuration of the guard of a real arm, whose commands come from the same process."""
-        return DvrkDriver(lcm_url="memq://", control_modes=self.control_modes, model=self.model, guard=self.guard)
 
     def arm_namespace(self, arm: Arm) -> str:
         """Returns the namespace of the topics of `arm`, beginning with "/"."""

@@ -72,7 +72,7 @@ class CrtkArmLink(MessageLink):
         _close_earlier(arm, driver)
         self._bridge: CrtkBridge = connect_bridge(
             arm,
-            driver.guard_driver(),
+            driver,
             self._receive,
             topic=driver.namespace or None,
             domain=driver.domain,

@@ -152,12 +152,12 @@ def test_command_writes_the_motion(tmp_path, monkeypatch, capsys):
     np.testing.assert_allclose(rows[:, 8:], motion.evaluate(rows[:, 0]).v, atol=1e-12)
     for options, message in (
         (["--output", "m.yaml"], "m.yaml already exists"),
-        (["--output", "n.yaml", "--position", "elbow_pitch=0"], "not of the form JOINT=LOWER:UPPER"),
+        (["--output", "n.yaml", "--position", "elbow_pitch=0"], "--position elbow_pitch=0: allowed: JOINT=LOWER:UPPER"),
         (["--output", "n.yaml", "--csv", "n.yaml"], "n.yaml"),
         (["--output", "n.yaml", "--csv", "n.csv", "--rate", "0"], "--rate is 0; allowed: 1 to 10000"),
         (["--output", "n.yaml", "--effort", "2"], "effort is 2; allowed: 0.05..1"),
         (["--output", "n.yaml"], "--rate requires --csv"),
-        (["--output", "n.yaml", "--position", "outer_yaw=0:1", "outer_yaw=0:0.5"], "outer_yaw was given twice"),
+        (["--output", "n.yaml", "--position", "outer_yaw=0:1", "outer_yaw=0:0.5"], "outer_yaw is given twice"),
     ):
         rate = ["--rate", "100"] if "--rate requires" in message else []
         assert main(["excite", "--arm", "mtmr", *options, *rate, *short]) == 2

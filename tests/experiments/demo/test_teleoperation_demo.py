@@ -73,16 +73,16 @@ def test_cli_writes_recording_and_errors(tmp_path, monkeypatch, capsys):
     short = partial(play_teleoperation, duration=0.6)
     monkeypatch.setattr("dvrk_drake.experiments.demo.teleoperation.play_teleoperation", short)
     page = tmp_path / "teleop.html"
-    assert main(["teleop", "--output", str(page)]) == 0
+    assert main(["simulate", "teleop", "--output", str(page)]) == 0
     assert "<html" in page.read_text()
     assert "position [mm]" in capsys.readouterr().out
 
 
 def test_cli_rejects_unwritable_output(tmp_path, capsys):
-    assert main(["teleop", "--output", str(tmp_path / "nowhere" / "x.html")]) == 2
+    assert main(["simulate", "teleop", "--output", str(tmp_path / "nowhere" / "x.html")]) == 2
     assert "its folder does not exist" in capsys.readouterr().err
 
 
 def test_cli_rejects_invalid_port(capsys):
-    assert main(["teleop", "--port", "80"]) == 2
+    assert main(["simulate", "teleop", "--port", "80"]) == 2
     assert "port 80 cannot be opened" in capsys.readouterr().err

@@ -35,7 +35,7 @@ _CORNERS = """() => {
 @pytest.fixture
 def teleop():
     """Process of the command `teleop`, and the address of its page."""
-    command = [sys.executable, "-m", "dvrk_drake.cli", "teleop"]
+    command = [sys.executable, "-m", "dvrk_drake.cli", "simulate", "teleop"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
             yield process, re.search(r"http://\S+?(?=;)", process.stdout.readline())[0]

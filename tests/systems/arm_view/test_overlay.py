@@ -13,10 +13,10 @@ from dvrk_drake.errors import ArmError, DvrkDrakeError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import set_arm_positions, shared_plant
 from dvrk_drake.systems.arm_view import page
+from dvrk_drake.systems.arm_view.drawn_arm import Visibility
 from dvrk_drake.systems.arm_view.efforts import LEVELS, axis_frames
 from dvrk_drake.systems.arm_view.overlay import ArmOverlay
 from dvrk_drake.systems.arm_view.page import start_meshcat
-from dvrk_drake.systems.arm_view.visibility import Visibility
 
 pytestmark = pytest.mark.drake_api
 

@@ -10,7 +10,7 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.guard.settings import GuardSettings
-from dvrk_drake.systems.lcm.dvrk_status import fill_in_guard
+from dvrk_drake.systems.lcm.messages import fill_in_guard
 
 A, LOWER, UPPER = ARM.limit_matrix()
 LOOK_AHEAD = np.array(ARM.gains.kd) / np.array(ARM.gains.kp)

@@ -15,7 +15,7 @@ from dvrk_drake.systems.guard.measurement import Measurement
 from dvrk_drake.systems.guard.settings import _WEAKER_IF_SMALLER as WEAKER_IF_SMALLER
 from dvrk_drake.systems.guard.settings import GuardSettings, PlausibilitySettings
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
-from dvrk_drake.systems.lcm.dvrk_status import fill_in_guard
+from dvrk_drake.systems.lcm.messages import fill_in_guard
 
 # Measurements
 

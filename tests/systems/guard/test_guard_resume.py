@@ -10,7 +10,7 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.systems.guard.command_expiry import WallClock
 from dvrk_drake.systems.guard.settings import GuardSettings
-from dvrk_drake.systems.lcm.dvrk_status import fill_in_guard
+from dvrk_drake.systems.lcm.messages import fill_in_guard
 
 MODES = pytest.mark.parametrize("mode", [Command.EFFORT, Command.POSITION])
 WAITING = modes(Command.HOLD)

@@ -13,8 +13,8 @@ from dvrk_drake.models.lcm_messages import create_key_file
 from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.guard.settings import GuardSettings
 from dvrk_drake.systems.guard.states import State
-from dvrk_drake.systems.lcm.dvrk_command import DvrkCommandReceiver
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.lcm.sim_dvrk_driver import DvrkArmServer
 
 pytestmark = pytest.mark.drake_api
 
@@ -67,7 +67,7 @@ def test_controller_starts_acts_and_hold_follows(name):
 def test_effort_of_the_position_controller_is_limited_in_rate():
     """Measurements that jump would reverse the efforts within one step."""
     model = ControlModel(IdentifiedModel.from_arm(ARM))
-    receiver = DvrkCommandReceiver(ARM, CommandGuard(ARM, 1, model))
+    receiver = DvrkArmServer(ARM, CommandGuard(ARM, 1, model))
     simulator = Simulator(receiver)
     context, limit = simulator.get_mutable_context(), ARM.effort_limits
     receiver.GetInputPort("state_estimated").FixValue(context, np.zeros(2 * ARM.num_joints))

@@ -9,20 +9,21 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from cyclopts import App, ArgumentCollection, Group, Parameter, Token
 
+import dvrk_drake as dvrk
+from dvrk_drake.errors import DvrkDrakeError, RecordingError
+
 if TYPE_CHECKING:
-    from dvrk_drake.models.arm import Arm as LoadedArm
-    from dvrk_drake.processes.arm_session import Dialog
-    from dvrk_drake.processes.connection import ArmConnection
     from dvrk_drake.progress import Progress
-    from dvrk_drake.recordings.recording import Recording as ReadRecording
+
+Value = TypeVar("Value")
 
 app = App(
     name="dvrk-drake",
@@ -144,7 +145,6 @@ def _topic_gravity(topic: str) -> tuple[float, float, float]:
 
 def _mounting_pitch(path: str) -> float:
     """Returns `mounting_pitch` of a configuration of the dVRK. Raises ValueError if it cannot be read."""
-    from dvrk_drake.errors import DvrkDrakeError
     from dvrk_drake.export.dvrk_psm_gravity_compensation import configured_pitch
 
     try:
@@ -284,8 +284,6 @@ class ConnectedArm:
         else:
             values, own = {"topic": self.topic, "domain": self.domain, **(ros or {})}, "ros"
         if given := [f"--{name.replace('_', '-')}" for name, value in values.items() if is_given(value)]:
-            from dvrk_drake.errors import DvrkDrakeError
-
             raise DvrkDrakeError(f"{' and '.join(given)}: only with --transport {own}")
 
     def as_text(self) -> str:
@@ -294,13 +292,10 @@ class ConnectedArm:
         values = {name: getattr(self, name, None) for name in names}
         return options_text(values | {"transport": "ros" if self.is_ros else None})
 
-    def connect(self, dialog: Dialog, **settings: Any) -> ArmConnection:
+    def connect(self, dialog: dvrk.Dialog, **settings: Any) -> dvrk.ArmConnection:
         """Returns the connection to the arm. See `dvrk_drake.connect` for `settings`."""
-        from dvrk_drake.models.arm_files import load_arm
-        from dvrk_drake.processes.connection import connect
-
-        connection = connect(
-            load_arm(self.arm),
+        connection = dvrk.connect(
+            dvrk.load_arm(self.arm),
             self.transport,
             lcm_url=self.lcm_url,
             key=self.key,
@@ -346,6 +341,8 @@ def options_text(values: Mapping[str, object]) -> str:
     return " ".join(words)
 
 
+#: Accepted words of --arrays.
+_ARRAYS = "NAME=VALUE, e.g. q=position; names: q, qd, tau, t, poses"
 _FILE = Group("Options for the file (docs/recordings.md)", sort_key=2)
 
 
@@ -407,17 +404,15 @@ class FileOptions:
         bool, Parameter(show_default=False, help="Omit rows with an empty cell, NaN or an infinite value.")
     ] = False
 
-    def read(self, path: str, arm: LoadedArm | None, progress: Progress) -> ReadRecording:
+    def read(self, path: str, arm: dvrk.Arm | None, progress: Progress) -> dvrk.Recording:
         """Reads a recording with these options. Raises RecordingError as `read_recording`."""
-        from dvrk_drake.recordings.reading import read_recording
-
-        return read_recording(path, arm, progress=progress, **self.as_arguments())
+        return dvrk.read_recording(path, arm, progress=progress, **self.as_arguments())
 
     def as_arguments(self) -> dict[str, Any]:
         """Returns the keyword arguments of `read_recording`."""
         return vars(self) | {
-            "joints": _named("joints", self.joints, "yaw=outer_yaw"),
-            "arrays": _named("arrays", self.arrays, "q=position; names: q, qd, tau, t, poses"),
+            "joints": self.joints and named("joints", self.joints, "NAME=VALUE, e.g. yaw=outer_yaw", str),
+            "arrays": self.arrays and named("arrays", self.arrays, _ARRAYS, str),
             "effort_scale": _factors(self.effort_scale),
         }
 
@@ -429,30 +424,40 @@ class FileOptions:
 
 def _factors(texts: Sequence[str] | None) -> dict[str, float] | float | None:
     """Returns the factor or the factors of --effort-scale."""
-    from dvrk_drake.errors import RecordingError
-
-    example = "elbow=11.8"
-    try:
-        if texts is not None and len(texts) == 1 and "=" not in texts[0]:
-            return float(texts[0])
-        named = _named("effort-scale", texts, example)
-        return None if named is None else {name: float(factor) for name, factor in named.items()}
-    except ValueError:
-        raise RecordingError(
-            f"--effort-scale {' '.join(texts or ())}: allowed: one number, or NAME=NUMBER, e.g. {example}"
-        ) from None
-
-
-def _named(option: str, texts: Sequence[str] | None, example: str) -> dict[str, str] | None:
-    """Returns the mapping of an option with arguments NAME=VALUE, or None without the option."""
-    from dvrk_drake.errors import RecordingError
-
     if texts is None:
         return None
-    pairs = [text.partition("=") for text in texts]
-    if wrong := [text for text, (name, sign, value) in zip(texts, pairs, strict=True) if not (name and sign and value)]:
-        raise RecordingError(f"--{option} {wrong[0]}: allowed: NAME=VALUE, e.g. {example}")
-    names = [name for name, _, _ in pairs]
-    if twice := [name for name in names if names.count(name) > 1]:
-        raise RecordingError(f"--{option}: {twice[0]} is given twice; give it once")
-    return {name: value for name, _, value in pairs}
+    if len(texts) == 1 and "=" not in texts[0]:
+        return named("effort-scale", [f"all={texts[0]}"], "one number, or NAME=NUMBER, e.g. elbow=11.8", float)["all"]
+    return named("effort-scale", texts, "one number, or NAME=NUMBER, e.g. elbow=11.8", float)
+
+
+def named(option: str, texts: Sequence[str], form: str, convert: Callable[[str], Value]) -> dict[str, Value]:
+    """Returns the mapping of an option with words NAME=VALUE.
+
+    Args:
+        option: Name of the option.
+        texts: Words of the option.
+        form: Description of the accepted words, with an example.
+        convert: Function that converts a value, and raises ValueError if it is not valid.
+
+    Raises:
+        RecordingError: A word is not valid, or a name is given twice.
+    """
+    values: dict[str, Value] = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        try:
+            if not (name and value):
+                raise ValueError
+            converted = convert(value)
+        except ValueError:
+            raise RecordingError(f"--{option} {text}: allowed: {form}") from None
+        if name in values:
+            raise RecordingError(f"--{option}: {name} is given twice; give it once")
+        values[name] = converted
+    return values
+
+
+def given(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the values that are not None, i.e. the options that are given."""
+    return {name: value for name, value in values.items() if value is not None}
