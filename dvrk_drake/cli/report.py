@@ -49,8 +49,18 @@ class Results:
         given = list(filter(None, inputs))
         for path in filter(None, (output, self._json)):
             support.check_output(path, *given, overwrite=self.overwrite)
-        check_report(self.report, *given, overwrite=self.overwrite)
-        support.plots_folder(self.plots, overwrite=self.overwrite)
+        if self.report is not None:
+            if not self.report.lower().endswith((".html", ".htm")):
+                raise DvrkDrakeError(f"{self.report}: --report writes HTML; the name of the file must end in .html")
+            support.check_output(self.report, *given, overwrite=self.overwrite)
+        # Modules that the results need are imported before the work begins, so that Ctrl-C ends the import at once.
+        with support.interrupt_ends_process():
+            if self.report is not None:
+                importlib.import_module("dvrk_drake.reports.html_file")
+            if self.plots is not None:
+                importlib.import_module("dvrk_drake.reports.image_files")
+        if self.plots is not None:
+            support.new_folder(self.plots, overwrite=self.overwrite)
 
     def show(
         self,
@@ -83,7 +93,18 @@ class Results:
         support.print_warnings(console, warnings)
         for path in filter(None, (saved, self._json)):
             support.print_written(path)
-        write_page(page, self.plots, self.report, *filter(None, inputs))
+        if self.plots is not None:
+            from dvrk_drake.reports.image_files import write_images
+
+            if write_images(page, Path(self.plots)):
+                support.print_written(self.plots)
+        if self.report is not None:
+            from dvrk_drake.reports.html_file import write_html
+            from dvrk_drake.reports.provenance import Provenance
+
+            with support.Steps("writing the report"):
+                write_html(page, self.report, Provenance.of(list(filter(None, inputs)), support.command_words))
+            support.print_written(self.report, "report")
 
     @property
     def _json(self) -> str | None:
@@ -96,47 +117,3 @@ class ResultsAndJson(Results):
     """Options of the commands that also write their result as JSON."""
 
     json: Json = None
-
-
-def check_report(path: str | None, *inputs: str, overwrite: bool) -> None:
-    """Checks the path given with --report before work begins, and imports the page builder. None: does nothing.
-
-    Args:
-        path: Path of the report.
-        inputs: Paths of the input files.
-        overwrite: Accept an existing file, because of --overwrite.
-
-    Raises:
-        DvrkDrakeError: The path does not end in .html, or cannot be written.
-    """
-    if path is None:
-        return
-    if not path.lower().endswith((".html", ".htm")):
-        raise DvrkDrakeError(f"{path}: --report writes HTML; the name of the file must end in .html")
-    support.check_output(path, *inputs, overwrite=overwrite)
-    with support.interrupt_ends_process():
-        importlib.import_module("dvrk_drake.reports.html_file")
-
-
-def write_page(page: Page, folder: Path | str | None, path: str | None, *inputs: str) -> None:
-    """Writes the plots and the report of a page, and prints their paths.
-
-    Args:
-        page: Page of the result.
-        folder: Folder of the plots, see `plots_folder`. None: no plots.
-        path: Path of the report. None: no report.
-        inputs: Paths of the input files.
-    """
-    from dvrk_drake.reports.provenance import Provenance
-
-    if folder is not None:
-        from dvrk_drake.reports.image_files import write_images
-
-        if write_images(page, Path(folder)):
-            support.print_written(folder)
-    if path is not None:
-        from dvrk_drake.reports.html_file import write_html
-
-        with support.Steps("writing the report"):
-            write_html(page, path, Provenance.of(inputs, support.command_words))
-        support.print_written(path, "report")

@@ -162,15 +162,6 @@ def new_folder(path: str, *, overwrite: bool) -> Path:
     return Path(path)
 
 
-def plots_folder(path: str | None, *, overwrite: bool) -> Path | None:
-    """Creates the folder given with --plots, and imports the plotting modules. Does nothing without --plots."""
-    if path is None:
-        return None
-    with interrupt_ends_process():
-        importlib.import_module("dvrk_drake.reports.image_files")
-    return new_folder(path, overwrite=overwrite)
-
-
 def print_written(path: str | Path, what: str = "") -> None:
     """Prints the path of a file or folder that was written, followed by the description `what`."""
     print(f"wrote {path}{what and ': '}{what}", flush=True)

@@ -360,7 +360,8 @@ def connect(
 def model_warning(path: str, model: IdentifiedModel) -> str:
     """Returns a warning if the model was not validated or a joint failed the validation, otherwise ""."""
     if model.validation is None:
-        bad = unfit(cross_validated_verdicts(model), "usable")
+        judged = {name: v for name, v in cross_validated_verdicts(model).items() if v != "not judged"}
+        bad = unfit(judged, "usable")
         verdict = f"; verdict by cross-validation: {', '.join(bad)}" if bad else ""
         command = f"dvrk-drake validate OTHER.csv --model {path} --save"
         return f"{path}: the model was not validated on another recording{verdict}; run: {command}"

@@ -10,10 +10,11 @@ import pytest
 from arm_processes import LONG_TIMEOUT_DRIVER, dvrk_drake
 from repository import ROOT
 from ros_publisher import DOMAIN_FILE
-from waiting import TIMEOUT
+from waiting import TIMEOUT, wait_until
 
 import dvrk_drake as dvrk
 from dvrk_drake.analysis.excitation.periodic_motion import FourierBasis, PeriodicMotion
+from dvrk_drake.analysis.excitation.pose_file import load_poses
 
 ros = pytest.importorskip("dvrk_drake.systems.ros.domain", reason="needs cyclonedds")
 
@@ -23,7 +24,7 @@ ARM = dvrk.load_arm("mtml")
 
 
 @pytest.mark.watchdog
-def test_motion_over_ros(tmp_path, monkeypatch):
+def test_motion_and_taught_pose_over_ros(tmp_path, monkeypatch):
     monkeypatch.setenv("CYCLONEDDS_URI", DOMAIN_FILE)
     from dvrk_drake.systems.ros.messages import Empty, OperatingState
 
@@ -44,10 +45,16 @@ def test_motion_over_ros(tmp_path, monkeypatch):
         coefficients = np.column_stack([before.q, np.outer(0.01 * span, np.ones(2))])
         path = tmp_path / "m.yaml"
         PeriodicMotion.of_coefficients(ARM, basis, coefficients, 2).save(path)
-        command = ("collect", "motion", path, "--arm", "mtml", "--transport", "ros", "--rehearse", "--realtime")
-        process = dvrk_drake(*command)
-        assert process.wait() == 0, process.output()
-        assert (tmp_path / "m_rehearsal.yaml").exists()
+        connected = ("--arm", "mtml", "--transport", "ros", "--realtime")
+        for task in (["--rehearse"], ["--output", tmp_path / "m.csv"]):
+            process = dvrk_drake("collect", "motion", path, *connected, *task)
+            assert process.wait() == 0, process.output()
+        assert len(dvrk.read_recording(tmp_path / "m.csv", ARM)) > 100
+        poses = tmp_path / "p.yaml"
+        process = dvrk_drake("collect", "teach", poses, *connected, "--at-rest")
+        wait_until(poses.exists, "a pose is recorded", process)
+        process.end(signal.SIGINT)
+        np.testing.assert_allclose(load_poses(poses, ARM)[0], before.q, atol=0.05)
         holds = domain.subscribe("/MTML/hold", Empty, depth=10)
         connection.hold()
         assert domain.wait_until(lambda: bool(holds.take()), 20.0)
