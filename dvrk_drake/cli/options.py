@@ -134,7 +134,6 @@ def gravity_vector(_: object, tokens: Sequence[Token]) -> tuple[float, float, fl
 
 
 def _topic_gravity(topic: str) -> tuple[float, float, float]:
-    from dvrk_drake.errors import DvrkDrakeError
     from dvrk_drake.systems.ros.mount_topic import topic_gravity
 
     try:

@@ -31,6 +31,8 @@ class NetworkArm(GuardedArm):
 
     def answer(self, guide):
         """Sends a status to the controller, and its command to the guard. Returns the efforts of the springs (n,)."""
+        if self.commands:
+            self.status.effort_measured = self.commands[-1].effort
         self.network.publish(status_channel(ARM), self.next_status(1.0).encode())
         self.link.send(guide.answer(self.link.next_status(1.0), self.now()))
         assert handle_message(self.network, 1.0)
