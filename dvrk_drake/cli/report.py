@@ -138,8 +138,6 @@ def write_page(page: Page, folder: Path | str | None, path: str | None, *inputs:
         path: Path of the report. None: no report.
         inputs: Paths of the input files.
     """
-    from dvrk_drake.reports.provenance import Provenance
-
     if folder is not None:
         from dvrk_drake.reports.image_files import write_images
 
@@ -149,5 +147,5 @@ def write_page(page: Page, folder: Path | str | None, path: str | None, *inputs:
         from dvrk_drake.reports.html_file import write_html
 
         with Steps("writing the report"):
-            write_html(page, path, Provenance.of(inputs, command_words))
+            write_html(page, path, inputs, command_words)
         print_written(path, "report")
