@@ -70,7 +70,6 @@ class Efforts:
         baselines: Name of another model ("SDF", "previous") -> its predicted efforts (r, n) [N m, N].
         usable: Mask (r, n) of the efforts that are not excluded.
         excluded: Excluded measurements and the reasons.
-        half_width: Half widths (n,) of the 95 % prediction intervals [N m, N], 0 if there are none.
         grid: Resampled motion, None for static poses.
         period: Period of the motion [s], None if it does not repeat.
     """
@@ -84,8 +83,7 @@ class Efforts:
     predicted: Mapping[str, NDArray[np.float64]]
     baselines: Mapping[str, NDArray[np.float64]]
     usable: NDArray[np.bool_]
-    excluded: Sequence[ExcludedMeasurement]
-    half_width: NDArray[np.float64]
+    excluded: Sequence[ExcludedMeasurement] = ()
     grid: MotionGrid | None = None
     period: float | None = None
 
@@ -93,6 +91,11 @@ class Efforts:
     def arm(self) -> Arm:
         """Arm of the model."""
         return self.model.arm
+
+    @property
+    def half_width(self) -> NDArray[np.float64]:
+        """Half widths (n,) of the 95 % prediction intervals [N m, N], 0 if there are none."""
+        return np.zeros(self.arm.num_joints) if self.grid is None else self.model.dynamic_model.half_width
 
     @property
     def judged(self) -> str:
@@ -118,7 +121,6 @@ def efforts_of(
     result: Identification | Validation, baselines: Mapping[str, NDArray[np.float64]] | None = None, number: int = 0
 ) -> Efforts:
     """Returns the efforts of a validation, or of one recording (index `number`) of an identification."""
-    n = result.model.arm.num_joints
     if isinstance(result, DynamicIdentification | DynamicValidation):
         if isinstance(result, DynamicIdentification):
             motion = result.motions[number]
@@ -138,8 +140,6 @@ def efforts_of(
             predicted=predicted,
             baselines=baselines or {},
             usable=np.ones(measured.shape, dtype=bool),
-            excluded=(),
-            half_width=result.model.dynamic_model.half_width,
             grid=grid,
             period=period,
         )
@@ -160,7 +160,6 @@ def efforts_of(
         baselines=baselines or {},
         usable=result.usable,
         excluded=result.excluded,
-        half_width=np.zeros(n),
     )
 
 

@@ -227,24 +227,19 @@ def compensation_page(comparison: CompensationComparison, *, file_name: str = ""
         rows.append((joint.name, f"{largest:.3f}", _number(joint.rms_inside), _number(joint.rms_outside), *shares))
         bounds = ((joint.model_lower, joint.model_upper), (joint.file_lower, joint.file_upper))
         ranges.append((joint.name, *(_range(*ends) for ends in (*bounds, (joint.clip_lower, joint.clip_upper)))))
-    sweep = "not stated in the file"
+    sweep = "the file does not state it"
     if comparison.file.sweep is not None:
-        sweep = f"contains {100 * comparison.in_sweep.mean():.0f} % of the poses"
-    explanation = (
-        f"Sweep: joint positions of the recording from which the file was computed ({sweep}). At limit, runaway, "
-        "opposed: shares of the poses. At limit: the torque of the file is at a torque limit. Runaway: without the "
-        "torque limits, the torque of the file is outside the torque range of the model by more than half of the width "
-        "of this range. Opposed: the torques of file and model have opposite signs, and both exceed a tenth of the "
-        "largest torque of the model."
+        sweep = f"it contains {100 * comparison.in_sweep.mean():.0f} % of the poses"
+    note = (
+        f"Sweep: joint positions of the recording from which the file was computed; {sweep}. docs/export.md defines "
+        "the last three columns, which are shares of the poses."
     )
     header = ("", "largest", "RMS, in sweep", "RMS, outside", "at limit", "runaway", "opposed")
     caption = f"Torque of the file minus model [N m], {len(comparison.q)} random static poses"
     limits = f"Torque ranges [N m] of {file_name}, {model_name}"
     blocks: list[Block] = [
         *(Text(f"{file_name}: {warning}.", "warning", show="page") for warning in comparison.warnings),
-        Table(header, rows, caption),
-        Text("--verbose explains these columns.", show="brief"),
-        Text(explanation, show="details"),
+        Table(header, rows, caption, note),
         Table(("", "model", "file before limits", "limits"), ranges, limits, show="details"),
     ]
     return Page(

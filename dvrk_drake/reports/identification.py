@@ -351,14 +351,14 @@ def _effort_sections(efforts: Efforts, name: str, suffix: str) -> list[Section]:
     of = f": {name}" if name else ""
     views = [] if suffix else [_view(efforts)]
     blocks: list[Block] = [*views, efforts_plot(efforts, f"efforts{suffix}", time=not suffix)]
-    note = (
-        "Predicted: efforts of the model for the positions of this recording."
-        if efforts.judged == "predicted"
-        else "Fitted: model identified from all data. Held out: prediction of a model that was identified without the "
-        "fold of the data that it predicts."
-    )
-    if efforts.v is not None:
-        note += f" {efforts.model.interval_scope}"
+    note = "Predicted: efforts of the model for the positions of this recording."
+    if efforts.judged != "predicted":
+        note = (
+            "Fitted: model identified from all data. Held out: prediction of a model that was identified without the "
+            "fold of the data that it predicts."
+        )
+        if efforts.v is not None:
+            note += f" {efforts.model.interval_scope}"
     causes = "offset, first and second harmonic of the position, load"
     if efforts.v is not None:
         causes = "offset, friction and position of the actuator, accelerations, positions of the other actuators"

@@ -278,7 +278,7 @@ def exact_session(truth, folder, executor, sample_sizes):
     q = ARM.sample_poses(20, np.random.default_rng(9))
     poses = Recording(q=q, tau=truth.exact.holding_torque(q), source="computed")
     session = ReproductionSession(folder, PaperRecordings(None), executor, sample_sizes=sample_sizes)
-    session.__dict__["mtm"] = IdentifiedArm(truth.arm, truth.origin, poses, truth.exact)
+    session.__dict__["mtm"] = IdentifiedArm(truth.arm, poses, truth.exact)
     return session
 
 

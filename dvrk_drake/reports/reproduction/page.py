@@ -126,7 +126,7 @@ def write_page(
 _PREFACE = (
     "This page compares published figures and tables of Gravity Compensation Control of da Vinci Robot (Rutfield, "
     "Zia, Boos, Santoso, Sujumnong, WPI 2015) with results of `dvrk-drake reproduce`. Each table is also a CSV file. "
-    "Angles are in rad, torques in N m. "
+    "Angles are in rad, torques in N m. docs/public_recordings.md describes the simulated arms. "
     '"The paper\'s" denotes the method or parameters of the paper, "ours" denotes the method or model of this project.'
 )
 _NEXT_DATA = (
