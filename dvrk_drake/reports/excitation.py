@@ -12,7 +12,7 @@ from dvrk_drake.analysis.excitation.design import ExcitationDesign
 from dvrk_drake.analysis.excitation.static_poses import StaticPoseDesign
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.reports.colours import COMMANDED, LIMIT
-from dvrk_drake.reports.page import Page, Plot, Scene, Section, Table
+from dvrk_drake.reports.page import Block, Page, Plot, Scene, Section, Table
 from dvrk_drake.reports.playback import playback
 from dvrk_drake.reports.plot import Curve, Guide, Mark, Panel, Style, joint_label, length_unit
 
@@ -68,7 +68,10 @@ def poses_page(design: StaticPoseDesign, *, next_step: str | None = None) -> Pag
         ("gravity parameters known to 10 %", f"{design.known_parameters} of {design.num_parameters}"),
     ]
     count = np.arange(1.0, len(poses) + 1)
-    views = [_view(arm, count, poses, len(poses)), _position_plot(arm, count, poses, "pose [1]", "circles")]
+    views: list[Block] = [
+        _view(arm, count, poses, len(poses)),
+        _position_plot(arm, count, poses, "pose [1]", "circles"),
+    ]
     return Page(
         f"Designed static poses of {arm.name}",
         f"{arm.name}: {len(poses)} static poses. Expected error of predicted holding efforts: "

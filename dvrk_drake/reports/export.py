@@ -261,11 +261,12 @@ def _compensation_plot(comparison: CompensationComparison) -> Plot:
 
 
 def _torque_panel(comparison: CompensationComparison, joint: JointComparison, j: int) -> Panel:
-    q, marks = comparison.q[:, j], list[Mark]()
+    q = comparison.q[:, j]
     edges = np.linspace(q.min(), q.max(), _BINS + 1)
     index = np.clip(np.digitize(q, edges) - 1, 0, _BINS - 1)
     filled = np.unique(index)
     centres, members = (edges[:-1] + edges[1:])[filled] / 2, [index == i for i in filled]
+    marks: list[Mark] = []
     if comparison.file.sweep is not None:
         low, high = np.clip(comparison.file.sweep[:, j], edges[0], edges[-1])
         marks.append(Guide("x", low, high, NEUTRAL, "positions in the recording of the file"))

@@ -29,7 +29,7 @@ from dvrk_drake.reports.efforts import (
     residuals_plot,
     structure_table,
 )
-from dvrk_drake.reports.page import Block, Level, Page, Scene, Section, Table, Text, Verdict, warning_texts
+from dvrk_drake.reports.page import Block, Cell, Level, Page, Scene, Section, Table, Text, Verdict, warning_texts
 from dvrk_drake.reports.parameters import parameter_blocks
 from dvrk_drake.reports.playback import playback
 
@@ -125,16 +125,17 @@ def _verdict_table(
         zero_torque: Relative error of zero torque as text.
     """
     columns = {heading: cells for heading, cells in columns.items() if any(cells)}
-    names, labels = list(verdicts), [Verdict(word, LEVELS[word]) for word in verdicts.values()]
-    if any(len(cells) > len(names) for cells in columns.values()):
-        names.append("mean")
+    labels = [Verdict(word, LEVELS[word]) for word in verdicts.values()]
+    has_mean = any(len(cells) > len(verdicts) for cells in columns.values())
+    names = [*verdicts, *(["mean"] if has_mean else [])]
     note = ""
     if "SDF error" in columns:
         note = (
             "SDF error: relative error of the nominal model, which consists of the SDF and the arm file. Zero torque "
             f"has a relative error of {zero_torque}."
         )
-    rows = list(zip_longest(names, labels, *columns.values(), fillvalue=""))
+    every: list[Sequence[Cell]] = [names, labels, *columns.values()]
+    rows = list(zip_longest(*every, fillvalue=""))
     return Table(("joint", "verdict", *columns), rows, caption, note)
 
 
@@ -156,8 +157,8 @@ def _relative(errors: Iterable[float], efforts: Iterable[float]) -> list[str]:
 def _percents(shares: Sequence[float | None]) -> list[str]:
     """Returns shares as text in percent, and their mean. A share that is None is unknown, and its text is ""."""
     known = [share for share in shares if share is not None]
-    mean = [float(np.mean(known))] if known else [None]
-    return ["" if share is None else percent(share) for share in [*shares, *mean]]
+    mean = float(np.mean(known)) if known else None
+    return ["" if share is None else percent(share) for share in (*shares, mean)]
 
 
 def _baselines(
