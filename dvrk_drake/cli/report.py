@@ -100,10 +100,9 @@ class Results:
                 support.print_written(self.plots)
         if self.report is not None:
             from dvrk_drake.reports.html_file import write_html
-            from dvrk_drake.reports.provenance import Provenance
 
             with support.Steps("writing the report"):
-                write_html(page, self.report, Provenance.of(list(filter(None, inputs)), support.command_words))
+                write_html(page, self.report, list(filter(None, inputs)), support.command_words)
             support.print_written(self.report, "report")
 
     @property

@@ -20,10 +20,9 @@ def status_page(arm: Arm, observation: ArmObservation) -> Page:
         position, velocity, effort = (f"{round(x, 3) + 0.0:.3f}" for x in measured)  # no -0.000
         rows.append((name, position, limits, velocity, effort, f"{shares[j]:.0f} %", observation.flags[j]))
     header = ("", "position", "limits", "velocity", "effort", "share of limit", "")
-    right = [False, True, True, True, True, True, False]
     blocks: list[Block] = [
         Text(" ".join(observation.notes)),
-        Table(header, rows, "Joints [rad, N m; prismatic: m, N]", right=right),
+        Table(header, rows, "Joints [rad, N m; prismatic: m, N]"),
     ]
     answer = f"{arm.name}: {observation.state}, {observation.why}."
     return Page(f"State of {arm.name}", answer, [Section("Joints", blocks)], level, observation.next_step)

@@ -21,17 +21,6 @@ LIMIT = "#b42508"
 #: Context without a message of its own, for example zero torque or a tolerance band.
 NEUTRAL = "#c4c8cf"
 
-#: Mapping from a role to its colour.
-ROLES = {
-    "measured": MEASURED,
-    "fitted": FITTED,
-    "held out": HELD_OUT,
-    "commanded": COMMANDED,
-    "reference": REFERENCE,
-    "limit": LIMIT,
-    "neutral": NEUTRAL,
-}
-
 #: Colours of series without a role, for example variations or joints in one plot. Use them in this order.
 SERIES = ("#1a429b", "#eb9804", "#cd1265", "#84ddb8", "#4e5d02", "#976a9f", "#fb6b5f", "#570e2d")
 

@@ -16,8 +16,8 @@ from dvrk_drake.reports.colours import FITTED, LIMIT, NEUTRAL, REFERENCE
 from dvrk_drake.reports.html_file import write_html
 from dvrk_drake.reports.image_files import write_images
 from dvrk_drake.reports.page import Block, Page, Plot, Scene, Section, Table, Text
+from dvrk_drake.reports.playback import playback
 from dvrk_drake.reports.plot import Curve, Guide, Mark, Panel, joint_label
-from dvrk_drake.reports.provenance import Provenance
 
 _REAL_ARM = (
     "With a real arm: record at least 40 different static poses with `dvrk-drake collect`, or convert a recording of "
@@ -37,26 +37,25 @@ def write_demo(result: DemoResult, folder: Path, command: Sequence[str] = ()) ->
         folder: Output folder of `run_demo`.
         command: Words of the command line, for the provenance.
     """
-    from dvrk_drake.reports.playback import playback  # slow to import
-
     arm = result.arm
     view = playback(
         arm,
         result.time,
         result.identified,
+        color=FITTED,
         ghost=result.nominal,
         phases=(
             (float(result.time[0]), "held: the controller regulates the pose"),
             (0.0, "released: no desired pose"),
         ),
-        colors={"#a0a4a8": "identified model, mode guide", REFERENCE: "model of the SDF, mode gravity"},
+        colors={FITTED: "identified model, mode guide", REFERENCE: "model of the SDF, mode gravity"},
         title=f"{arm.name} (simulated) - dvrk-drake demo",
     )
     with atomic_write(folder / "arm.html") as stream:
         stream.write(view)
     page = demo_page(result, folder)
     write_images(page, folder)
-    write_html(page, folder / "report.html", Provenance.of([folder / "poses.csv"], command))
+    write_html(page, folder / "report.html", [folder / "poses.csv"], command)
     return page
 
 
@@ -92,7 +91,7 @@ def demo_page(result: DemoResult, folder: Path) -> Page:
         Text(_REAL_ARM, show="details"),
     ]
     view = folder / "arm.html"
-    caption = "Identified model in mode guide (grey), model of the SDF in mode gravity (green)"
+    caption = "Identified model in mode guide (blue), model of the SDF in mode gravity (green)"
     scene = [Scene(view.read_text, caption, start=float(result.time[0]))]
     return Page(
         f"Demo: {arm.name}, simulated",

@@ -20,7 +20,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.reports.colours import COMMANDED, FITTED, HELD_OUT, MEASURED, NEUTRAL, REFERENCE, SERIES
-from dvrk_drake.reports.page import Plot, Table
+from dvrk_drake.reports.page import Plot, Table, Text
 from dvrk_drake.reports.plot import (
     Band,
     Bars,
@@ -70,8 +70,6 @@ class Efforts:
         baselines: Name of another model ("SDF", "previous") -> its predicted efforts (r, n) [N m, N].
         usable: Mask (r, n) of the efforts that are not excluded.
         excluded: Excluded measurements and the reasons.
-        half_width: Half widths (n,) of the 95 % prediction intervals [N m, N], 0 if there are none.
-        repeatability: RMS differences (n,) of the efforts between periods [N m, N], 0 if unknown.
         grid: Resampled motion, None for static poses.
         period: Period of the motion [s], None if it does not repeat.
     """
@@ -85,9 +83,7 @@ class Efforts:
     predicted: Mapping[str, NDArray[np.float64]]
     baselines: Mapping[str, NDArray[np.float64]]
     usable: NDArray[np.bool_]
-    excluded: Sequence[ExcludedMeasurement]
-    half_width: NDArray[np.float64]
-    repeatability: NDArray[np.float64]
+    excluded: Sequence[ExcludedMeasurement] = ()
     grid: MotionGrid | None = None
     period: float | None = None
 
@@ -95,6 +91,11 @@ class Efforts:
     def arm(self) -> Arm:
         """Arm of the model."""
         return self.model.arm
+
+    @property
+    def half_width(self) -> NDArray[np.float64]:
+        """Half widths (n,) of the 95 % prediction intervals [N m, N], 0 if there are none."""
+        return np.zeros(self.arm.num_joints) if self.grid is None else self.model.dynamic_model.half_width
 
     @property
     def judged(self) -> str:
@@ -120,17 +121,14 @@ def efforts_of(
     result: Identification | Validation, baselines: Mapping[str, NDArray[np.float64]] | None = None, number: int = 0
 ) -> Efforts:
     """Returns the efforts of a validation, or of one recording (index `number`) of an identification."""
-    n = result.model.arm.num_joints
     if isinstance(result, DynamicIdentification | DynamicValidation):
         if isinstance(result, DynamicIdentification):
             motion = result.motions[number]
             recording, grid, period, measured = motion.recording, motion.grid, motion.period, motion.measured
             predicted = {"fitted": motion.predicted, "held out": motion.held_out}
-            repeatability = [a.rms_repeatability for a in result.model.dynamic_model.section.actuators]
         else:
             recording, grid, period, measured = result.recording, result.grid, result.period, result.measured
             predicted = {"predicted": result.predicted}
-            repeatability = [(a.repeatability or 0.0) * a.rms_effort for a in result.actuators]
         t, q, v = grid.actuator_motion()
         return Efforts(
             model=result.model,
@@ -142,9 +140,6 @@ def efforts_of(
             predicted=predicted,
             baselines=baselines or {},
             usable=np.ones(measured.shape, dtype=bool),
-            excluded=(),
-            half_width=result.model.dynamic_model.half_width,
-            repeatability=np.array(repeatability),
             grid=grid,
             period=period,
         )
@@ -165,8 +160,6 @@ def efforts_of(
         baselines=baselines or {},
         usable=result.usable,
         excluded=result.excluded,
-        half_width=np.zeros(n),
-        repeatability=np.zeros(n),
     )
 
 
@@ -193,20 +186,18 @@ def efforts_plot(efforts: Efforts, name: str = "efforts", *, time: bool = True) 
         marks.append(Curve("measured", x, efforts.measured[rows, j], MEASURED, styles[0]))
         residuals: list[Mark] = [Guide("y", 0.0, None, NEUTRAL, dashed=False)]
         for other, values in efforts.baselines.items():
-            marks.append(Curve(f"model {other}", x, values[rows, j], _COLOURS[other], styles[2]))
+            marks.append(Curve(f"{other} model", x, values[rows, j], _COLOURS[other], styles[2]))
         for prediction, values in efforts.predicted.items():
             marks.append(Curve(prediction, x, values[rows, j], _COLOURS[prediction], styles[1]))
             error = efforts.measured[rows, j] - values[rows, j]
             residuals.append(Curve("", x, error, _COLOURS[prediction], styles[1]))
-        last = j == arm.num_joints - 1
-        title = _title(efforts, j)
-        panels.append(Panel(title, marks, "", f"effort [{unit}]", height=150, x_ticks=False))
-        panels.append(Panel("", residuals, x_label if last else "", f"residual [{unit}]", height=100, x_ticks=last))
+        panels.append(Panel(_title(efforts, j), marks, x_label, f"effort [{unit}]", height=150))
+        panels.append(Panel("", residuals, x_label, f"residual [{unit}]", height=100))
     caption = "Measured and predicted effort of each joint, and below it measured minus predicted effort"
     if efforts.grid is not None:
         cut_off = efforts.grid.settings.effort_cut_off
         caption = f"Efforts of the actuators below {cut_off:.3g} Hz, and below them measured minus predicted effort"
-    return Plot(name, caption, panels, time=time)
+    return Plot(name, caption, panels, time=time, shared_x=True)
 
 
 def _title(efforts: Efforts, j: int) -> str:
@@ -313,24 +304,27 @@ def budget_plot(efforts: Efforts, name: str = "error_budget") -> Plot:
     return Plot(name, caption, [category_panel("", marks, "RMS error / RMS effort [%]")])
 
 
-def structure_table(efforts: Efforts) -> Table:
-    """Returns the structures that explain the error of each joint, see `residual_structure`."""
-    rows = []
+def structure_table(efforts: Efforts) -> Table | Text:
+    """Returns the structures that explain the error of joints, see `residual_structure`, or that there are none."""
+    rows, is_motion = [], efforts.v is not None
+    tested = "first and second harmonic of the position of the joint, load"
+    if is_motion:
+        tested += ", friction, hysteresis, friction that grows with the load"
     for j, name in enumerate(efforts.arm.joint_names):
         use = efforts.usable[:, j]
-        if not np.any(efforts.measured[use, j]):
-            continue
-        v = None if efforts.v is None else efforts.v[use, j]
-        load = efforts.predicted[efforts.judged][use, j]
-        found = residual_structure(efforts.residuals[use, j], efforts.q[use, j], load, v)
-        best, share = (found[0][0], f"{100 * found[0][1]:.0f} %") if found else ("none of those tested", "")
-        rows.append((name, best, share))
+        if np.any(efforts.measured[use, j]):
+            v = None if efforts.v is None else efforts.v[use, j]
+            load = efforts.predicted[efforts.judged][use, j]
+            rows += [
+                (name, kind, f"{100 * share:.0f} %")
+                for kind, share in residual_structure(efforts.residuals[use, j], efforts.q[use, j], load, v)[:1]
+            ]
+    if not rows:
+        return Text(f"No tested structure explains the errors. Tested: {tested}.", show="details")
     return Table(
         ("joint", "structure in the residual", "explained"),
         rows,
         "Structure that explains most of the squared error beyond the mean error",
-        "Tested: first and second harmonic of the position of the joint, load"
-        + ("" if efforts.v is None else ", friction, hysteresis, friction that grows with the load")
-        + ".",
+        f"Tested: {tested}. Joints without such a structure are not listed.",
         show="details",
     )

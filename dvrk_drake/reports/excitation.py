@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from dvrk_drake.analysis.excitation.static_poses import StaticPoseDesign
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.reports.colours import COMMANDED, LIMIT
 from dvrk_drake.reports.page import Block, Page, Plot, Scene, Section, Table
+from dvrk_drake.reports.playback import playback
 from dvrk_drake.reports.plot import Curve, Guide, Mark, Panel, Style, joint_label, length_unit
 
 #: Number of points per harmonic of a period in the plots: enough for a smooth curve.
@@ -28,10 +30,7 @@ def motion_page(design: ExcitationDesign, *, next_step: str | None = None) -> Pa
     arm, motion = design.arm, design.motion
     t = np.linspace(0.0, motion.period, _POINTS * np.shape(motion.sine)[1] + 1)
     q, v = motion.evaluate(t)[:2]
-    answer = (
-        f"{arm.name}: motion of {motion.duration:g} s. Expected error of predicted efforts: "
-        f"{100 * design.expected_error:.1f} % ({100 * design.random_error:.1f} % with the best random motion)."
-    )
+    speeds = [f", at most {v_max:.2g} {length_unit(arm, j)}/s" for j, v_max in enumerate(np.abs(v).max(axis=0))]
     rows = [
         ("expected error [%]", f"{100 * design.expected_error:.2f}"),
         ("expected error of the best random motion [%]", f"{100 * design.random_error:.2f}"),
@@ -42,14 +41,13 @@ def motion_page(design: ExcitationDesign, *, next_step: str | None = None) -> Pa
         "The expected error is that of the efforts which an identified model predicts for random motions within the "
         "limits, relative to the RMS efforts."
     )
-    speeds = np.abs(v).max(axis=0)
     return Page(
         f"Designed motion of {arm.name}",
-        answer,
+        f"{arm.name}: motion of {motion.duration:g} s. Expected error of predicted efforts: "
+        f"{100 * design.expected_error:.1f} % ({100 * design.random_error:.1f} % with the best random motion).",
         [
             Section("Information", [Table(("quantity", "value"), rows, note=note)]),
-            Section("One period", [_view(arm, t, q), _position_plot(arm, t, q, "t [s]", "line")]),
-            Section("Range of each joint", [_range_table(arm, q, speeds)]),
+            Section("One period", [_view(arm, t, q), _position_plot(arm, t, q, "t [s]", "line", speeds)]),
         ],
         "good",
         next_step or f"dvrk-drake collect motion MOTION.yaml --arm {arm.source} --rehearse",
@@ -64,69 +62,54 @@ def poses_page(design: StaticPoseDesign, *, next_step: str | None = None) -> Pag
         next_step: Suggested next command. None: the command that measures the poses, with placeholders for its files.
     """
     arm, poses = design.arm, design.poses
-    answer = (
-        f"{arm.name}: {len(poses)} static poses. Expected error of predicted holding efforts: "
-        f"{100 * design.expected_error:.1f} % ({100 * design.random_error:.1f} % with {len(poses)} random poses)."
-    )
     rows = [
         ("expected error [%]", f"{100 * design.expected_error:.2f}"),
         ("median expected error of random poses [%]", f"{100 * design.random_error:.2f}"),
         ("gravity parameters known to 10 %", f"{design.known_parameters} of {design.num_parameters}"),
     ]
     count = np.arange(1.0, len(poses) + 1)
-    views: list[Block] = [_view(arm, count, poses), _position_plot(arm, count, poses, "pose", "circles")]
+    views: list[Block] = [
+        _view(arm, count, poses, len(poses)),
+        _position_plot(arm, count, poses, "pose [1]", "circles"),
+    ]
     return Page(
         f"Designed static poses of {arm.name}",
-        answer,
-        [
-            Section("Information", [Table(("quantity", "value"), rows)]),
-            Section("Poses in their order", views),
-            Section("Range of each joint", [_range_table(arm, poses)]),
-        ],
+        f"{arm.name}: {len(poses)} static poses. Expected error of predicted holding efforts: "
+        f"{100 * design.expected_error:.1f} % ({100 * design.random_error:.1f} % with {len(poses)} random poses).",
+        [Section("Information", [Table(("quantity", "value"), rows)]), Section("Poses in their order", views)],
         "good",
         next_step or f"dvrk-drake collect poses POSES.yaml --arm {arm.source} --output POSES.csv",
     )
 
 
-def _view(arm: Arm, t: NDArray[np.float64], q: NDArray[np.float64]) -> Scene:
-    def html() -> str:
-        from dvrk_drake.reports.playback import playback  # slow to import, and a terminal does not need it
-
-        return playback(arm, t, q)
-
-    return Scene(html, "Arm at the desired positions", float(t[0]))
+def _view(arm: Arm, t: NDArray[np.float64], q: NDArray[np.float64], poses: int = 0) -> Scene:
+    return Scene(partial(playback, arm, t, q), "Arm at the desired positions", float(t[0]), poses)
 
 
-def _position_plot(arm: Arm, x: NDArray[np.float64], q: NDArray[np.float64], x_label: str, style: Style) -> Plot:
-    """Returns the positions q (m, n) over x (m,), with the position limits."""
+def _position_plot(
+    arm: Arm,
+    x: NDArray[np.float64],
+    q: NDArray[np.float64],
+    x_label: str,
+    style: Style,
+    remarks: Sequence[str] | None = None,
+) -> Plot:
+    """Returns the positions q (m, n) over x (m,), with the position limits and remarks (n,) in the titles."""
     panels = []
-    for j in range(arm.num_joints):
+    for j, remark in enumerate(remarks or arm.num_joints * [""]):
         lower, upper = arm.position_lower[j], arm.position_upper[j]
         margin = 0.05 * (upper - lower)
+        share = 100 * np.ptp(q[:, j]) / (upper - lower)
         marks: list[Mark] = [Guide("y", limit, None, LIMIT, "position limit") for limit in (lower, upper)]
         marks.append(Curve("desired position", x, q[:, j], COMMANDED, style))
-        last = j == arm.num_joints - 1
         panels.append(
             Panel(
-                joint_label(arm, j),
+                f"{joint_label(arm, j)}: {share:.0f} % of the range{remark}",
                 marks,
-                x_label if last else "",
+                x_label,
                 f"q [{length_unit(arm, j)}]",
                 y_range=(lower - margin, upper + margin),
                 height=120,
-                x_ticks=last,
             )
         )
-    return Plot("positions", "Desired positions and position limits", panels, time=True)
-
-
-def _range_table(arm: Arm, q: NDArray[np.float64], speeds: Sequence[float] | NDArray[np.float64] = ()) -> Table:
-    """Returns the used range of each joint, and its largest speed if `speeds` (n,) are given."""
-    rows = []
-    for j, name in enumerate(arm.joint_names):
-        unit, low, high = length_unit(arm, j), q[:, j].min(), q[:, j].max()
-        share = (high - low) / (arm.position_upper[j] - arm.position_lower[j])
-        speed = (f"{speeds[j]:.3g} {unit}/s",) if len(speeds) else ()
-        rows.append((name, f"{low:.3g} to {high:.3g} {unit}", f"{100 * share:.0f} %", *speed))
-    header = ("", "positions", "share of the range", *(("largest speed",) if len(speeds) else ()))
-    return Table(header, rows, "Range of the joints that is used", show="page")
+    return Plot("positions", "Desired positions and position limits", panels, time=True, shared_x=True)

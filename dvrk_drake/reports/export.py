@@ -18,12 +18,12 @@ from dvrk_drake.export.gravity_compensation_loss import ROUNDING, CompensationLo
 from dvrk_drake.export.model_export import DriveApproximation, ModelExport
 from dvrk_drake.export.model_writer import LinkChange, changed_links
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.reports.colours import FITTED, LIMIT, NEUTRAL, REFERENCE, SERIES
+from dvrk_drake.reports.colours import FITTED, LIMIT, NEUTRAL, REFERENCE
 from dvrk_drake.reports.page import Block, Page, Plot, Section, Table, Text
 from dvrk_drake.reports.plot import Band, Curve, Guide, Mark, Panel, Style
 
-#: Number of bins over the position of a joint, and number of panels. The file has no torque for joint 7.
-_BINS, _PANELS = 60, 6
+#: Number of bins over the position of a joint.
+_BINS = 60
 
 
 def export_page(path: str, export: ModelExport) -> Page:
@@ -58,7 +58,7 @@ def _bodies_page(path: str, export: ModelExport, bodies: ModelBodies) -> Page:
     if changes:
         before, after = (sum(getattr(c, which).parameters[0] for c in changes) for which in ("before", "after"))
         answer = f"{len(changes)} links differ from the SDF of the arm. Their mass changes by {after - before:+.4f} kg."
-        blocks = [_mass_table(changes), _inertia_table(changes)]
+        blocks = [_mass_table(changes)]
     if bodies.rotors:
         rotors = ", ".join(f"{name} {inertia:.3g}" for name, inertia in bodies.rotors.items())
         blocks.append(Text(f"Reflected rotor inertias [kg m^2; kg if prismatic]: {rotors}"))
@@ -79,7 +79,7 @@ def _drive_table(arm: Arm, drives: DriveApproximation) -> Table:
     ]
     header = ("", "drive effects", "not exported", "share")
     caption = "RMS effort of friction, cables and springs during a motion [N m; N if prismatic]"
-    return Table(header, rows, caption, right=[False, True, True, True])
+    return Table(header, rows, caption)
 
 
 def _mass_table(changes: Sequence[LinkChange]) -> Table:
@@ -91,21 +91,7 @@ def _mass_table(changes: Sequence[LinkChange]) -> Table:
         rows.append((change.link, *masses, *(_place(body.get_com()) for body in bodies)))
     header = ("", "mass, SDF [kg]", "mass [kg]", "centre of mass, SDF [mm]", "centre of mass [mm]")
     caption = "Links in the SDF of the arm and in the exported file, in link frames"
-    return Table(header, rows, caption, right=[False, True, True, True, True])
-
-
-def _inertia_table(changes: Sequence[LinkChange]) -> Table:
-    rows = []
-    for change in changes:
-        cells = []
-        for inertia in (change.before, change.after):
-            body = inertia.to_spatial_inertia()
-            about_centre = body.Shift(body.get_com()).CalcRotationalInertia()
-            moments = about_centre.CalcPrincipalMomentsAndAxesOfInertia()[0]
-            cells.append(" ".join(f"{1e4 * x:9.4f}" for x in moments))
-        rows.append((change.link, *cells))
-    caption = "Principal moments of inertia about the centre of mass [kg cm^2]"
-    return Table(("", "SDF of the arm", "exported"), rows, caption, show="details", right=[False, True, True])
+    return Table(header, rows, caption)
 
 
 def _place(place: NDArray[np.float64]) -> str:
@@ -171,7 +157,7 @@ def _kinematic_compensation_page(path: str, export: ModelExport, file: Kinematic
     blocks += [
         Table(header, rows, caption, note),
         *_causes(file.loss),
-        Table(("", "mass [kg]", "x, y, z [mm]"), links, chain, show="details", right=[False, True, True]),
+        Table(("", "mass [kg]", "x, y, z [mm]"), links, chain, show="details"),
         *_disabled_joints(export.model, ARM_JOINTS),
         *_estimates(export),
     ]
@@ -241,24 +227,19 @@ def compensation_page(comparison: CompensationComparison, *, file_name: str = ""
         rows.append((joint.name, f"{largest:.3f}", _number(joint.rms_inside), _number(joint.rms_outside), *shares))
         bounds = ((joint.model_lower, joint.model_upper), (joint.file_lower, joint.file_upper))
         ranges.append((joint.name, *(_range(*ends) for ends in (*bounds, (joint.clip_lower, joint.clip_upper)))))
-    sweep = "not stated in the file"
+    sweep = "the file does not state it"
     if comparison.file.sweep is not None:
-        sweep = f"contains {100 * comparison.in_sweep.mean():.0f} % of the poses"
-    explanation = (
-        f"Sweep: joint positions of the recording from which the file was computed ({sweep}). At limit, runaway, "
-        "opposed: shares of the poses. At limit: the torque of the file is at a torque limit. Runaway: without the "
-        "torque limits, the torque of the file is outside the torque range of the model by more than half of the width "
-        "of this range. Opposed: the torques of file and model have opposite signs, and both exceed a tenth of the "
-        "largest torque of the model."
+        sweep = f"it contains {100 * comparison.in_sweep.mean():.0f} % of the poses"
+    note = (
+        f"Sweep: joint positions of the recording from which the file was computed; {sweep}. docs/export.md defines "
+        "the last three columns, which are shares of the poses."
     )
     header = ("", "largest", "RMS, in sweep", "RMS, outside", "at limit", "runaway", "opposed")
     caption = f"Torque of the file minus model [N m], {len(comparison.q)} random static poses"
     limits = f"Torque ranges [N m] of {file_name}, {model_name}"
     blocks: list[Block] = [
         *(Text(f"{file_name}: {warning}.", "warning", show="page") for warning in comparison.warnings),
-        Table(header, rows, caption, right=[k > 0 for k in range(7)]),
-        Text("--verbose explains these columns.", show="brief"),
-        Text(explanation, show="details"),
+        Table(header, rows, caption, note),
         Table(("", "model", "file before limits", "limits"), ranges, limits, show="details"),
     ]
     return Page(
@@ -272,21 +253,19 @@ def compensation_page(comparison: CompensationComparison, *, file_name: str = ""
 
 
 def _compensation_plot(comparison: CompensationComparison) -> Plot:
-    """Returns the torques over the position of each joint, and below them the share of poses with each problem."""
-    panels: list[Panel] = []
-    for first in range(0, _PANELS, 2):
-        pair = range(first, first + 2)
-        panels += [_torque_panel(comparison, comparison.joints[j], j) for j in pair]
-        panels += [_problem_panel(comparison, j) for j in pair]
-    caption = (
-        "static torque: mean (line) and range (band) over the positions of the other joints, and share of the poses "
-        "with each problem"
-    )
+    """Returns the torques of the file and of the model over the position of each joint."""
+    # The file has no torque for the last joint.
+    panels = [_torque_panel(comparison, joint, j) for j, joint in enumerate(comparison.joints[:-1])]
+    caption = "Static torque: mean (line) and range (band) over the positions of the other joints"
     return Plot("compensation", caption, panels, columns=2)
 
 
 def _torque_panel(comparison: CompensationComparison, joint: JointComparison, j: int) -> Panel:
-    edges, centres, members = _position_bins(comparison, j)
+    q = comparison.q[:, j]
+    edges = np.linspace(q.min(), q.max(), _BINS + 1)
+    index = np.clip(np.digitize(q, edges) - 1, 0, _BINS - 1)
+    filled = np.unique(index)
+    centres, members = (edges[:-1] + edges[1:])[filled] / 2, [index == i for i in filled]
     marks: list[Mark] = []
     if comparison.file.sweep is not None:
         low, high = np.clip(comparison.file.sweep[:, j], edges[0], edges[-1])
@@ -301,29 +280,6 @@ def _torque_panel(comparison: CompensationComparison, joint: JointComparison, j:
     for limit in (joint.clip_lower, joint.clip_upper):
         marks.append(Guide("y", limit, None, LIMIT, "torque limits of the file"))
     return Panel(f"J{j + 1} {joint.name}", marks, f"q{j + 1} [rad]", "torque [N m]", height=210)
-
-
-def _problem_panel(comparison: CompensationComparison, j: int) -> Panel:
-    _, centres, members = _position_bins(comparison, j)
-    flags = {"torque limit active": comparison.clipped, "opposite sign": comparison.opposed}
-    flags["runaway"] = comparison.runaway
-    curves = [
-        Curve(f"{name} (share of poses)", centres, [100 * float(flag[m, j].mean()) for m in members], SERIES[k])
-        for k, (name, flag) in enumerate(flags.items())
-    ]
-    return Panel("", curves, f"q{j + 1} [rad]", "poses [%]", y_range=(-3.0, 103.0), height=80)
-
-
-def _position_bins(
-    comparison: CompensationComparison, j: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64], list[NDArray[np.int_]]]:
-    """Returns the edges of all bins of q_j, the centres of the bins that contain poses, and the poses in each bin."""
-    q = comparison.q[:, j]
-    edges = np.linspace(q.min(), q.max(), _BINS + 1)
-    index = np.clip(np.digitize(q, edges) - 1, 0, _BINS - 1)
-    members = [np.flatnonzero(index == i) for i in range(_BINS)]
-    used = [i for i, m in enumerate(members) if len(m)]
-    return edges, (edges[:-1] + edges[1:])[used] / 2, [members[i] for i in used]
 
 
 def _range(lower: float, upper: float) -> str:

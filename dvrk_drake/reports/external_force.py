@@ -9,7 +9,8 @@ from dvrk_drake.analysis.external_force import ExternalForce
 from dvrk_drake.dynamics.contact import is_measurable
 from dvrk_drake.models.effects_schema import half_width
 from dvrk_drake.reports.colours import FITTED, HELD_OUT, NEUTRAL
-from dvrk_drake.reports.page import Block, Page, Plot, Scene, Section, Table, Text
+from dvrk_drake.reports.page import Block, Page, Plot, Scene, Section, Table, Text, warning_texts
+from dvrk_drake.reports.playback import frame_times, playback
 from dvrk_drake.reports.plot import Band, Curve, Guide, Mark, Panel, decimated, effort_unit, joint_label
 
 #: Largest number of plotted rows. Each curve has about this number of points, twice the pixels of a wide page.
@@ -23,15 +24,14 @@ def force_page(result: ExternalForce) -> Page:
         result: Result of `dvrk_drake.estimate_force`.
     """
     arm = result.model.arm
-    warnings = [Text(str(w).removeprefix("warning: "), "warning", show="page") for w in result.warnings]
     note = "The intervals contain 95 % of the errors on recordings similar to those of the model."
     plots: list[Block] = [_force_plot(result), _scene(result)] if np.any(result.measurable) else []
     return Page(
         f"External force on {arm.name}",
         _answer(result),
         [
-            Section("Force", [_force_table(result), *plots, Text(note, show="page"), *warnings]),
-            Section("Joint efforts", [_effort_table(result), _effort_plot(result)]),
+            Section("Force", [_force_table(result), *plots, Text(note, show="page"), *warning_texts(result.warnings)]),
+            Section("Joint efforts", [_effort_plot(result)]),
         ],
         "good" if np.any(result.measurable) else "warning",
     )
@@ -82,27 +82,6 @@ def _force_table(result: ExternalForce) -> Table:
         f"Force at {_where(result)}",
         "* share of the rows in which the joints determine the component. ** share of these rows in which the 95 % "
         "interval does not contain 0. interval: median of the half width.",
-        right=[False, *[True] * 6],
-    )
-
-
-def _effort_table(result: ExternalForce) -> Table:
-    rows = [
-        (name, f"{rms:.4f}", f"{width:.4f}", f"{100 * share:.0f} %")
-        for name, rms, width, share in zip(
-            result.model.arm.joint_names,
-            np.sqrt(np.mean(result.effort**2, axis=0)),
-            np.median(result.effort_half_width, axis=0),
-            np.mean(np.abs(result.effort) > result.effort_half_width, axis=0),
-            strict=True,
-        )
-    ]
-    return Table(
-        ("", "RMS", "interval +-", "not 0"),
-        rows,
-        "External joint efforts [N m; N]",
-        show="details",
-        right=[False, True, True, True],
     )
 
 
@@ -110,8 +89,8 @@ def _force_plot(result: ExternalForce) -> Plot:
     hidden = ~result.measurable
     force, width = (np.where(hidden, np.nan, x) for x in (result.force, result.half_width))
     shown = [(i, name) for i, name in enumerate(_names(result)) if np.any(result.measurable[:, i])]
-    panels = [_panel(result, name, force[:, i], width[:, i], "force [N]", (i, name) == shown[-1]) for i, name in shown]
-    return Plot("force", f"Force at {_where(result)}, with its 95 % interval", panels, time=True)
+    panels = [_panel(result, name, force[:, i], width[:, i], "force [N]") for i, name in shown]
+    return Plot("force", f"Force at {_where(result)}, with its 95 % interval", panels, time=True, shared_x=True)
 
 
 def _scene(result: ExternalForce) -> Scene:
@@ -119,8 +98,7 @@ def _scene(result: ExternalForce) -> Scene:
     x = _x(result)
 
     def html() -> str:
-        from dvrk_drake.reports.playback import frame_times, playback  # slow to import, and a terminal does not need it
-        from dvrk_drake.systems.arm_view.force_arrow import DrawnForce
+        from dvrk_drake.systems.arm_view.force_arrow import DrawnForce  # slow to import
 
         rows = np.unique(np.searchsorted(x, frame_times(float(x[0]), float(x[-1]))))
         forces, contact = [], result.contact
@@ -131,23 +109,15 @@ def _scene(result: ExternalForce) -> Scene:
         return playback(result.model.arm, x[rows], result.q[rows], forces=forces)
 
     caption = "Force on the arm. The ellipsoid contains it with 95 % probability. Click a plot to show a time."
-    return Scene(html, caption, float(x[0]))
+    return Scene(html, caption, float(x[0]), len(x) if result.t is None else 0)
 
 
 def _effort_plot(result: ExternalForce) -> Plot:
-    arm, n = result.model.arm, result.effort.shape[1]
-    panels = [
-        _panel(
-            result,
-            joint_label(arm, j),
-            result.effort[:, j],
-            result.effort_half_width[:, j],
-            f"effort [{effort_unit(arm, j)}]",
-            j == n - 1,
-        )
-        for j in range(n)
-    ]
-    return Plot("external_efforts", "External joint efforts, with their 95 % intervals", panels, time=True)
+    arm, panels = result.model.arm, []
+    for j, (effort, width) in enumerate(zip(result.effort.T, result.effort_half_width.T, strict=True)):
+        panels.append(_panel(result, joint_label(arm, j), effort, width, f"effort [{effort_unit(arm, j)}]"))
+    caption = "External joint efforts, with their 95 % intervals"
+    return Plot("external_efforts", caption, panels, time=True, shared_x=True)
 
 
 def _x(result: ExternalForce) -> NDArray[np.float64]:
@@ -158,7 +128,7 @@ def _x(result: ExternalForce) -> NDArray[np.float64]:
 
 
 def _panel(
-    result: ExternalForce, title: str, values: NDArray[np.float64], width: NDArray[np.float64], label: str, last: bool
+    result: ExternalForce, title: str, values: NDArray[np.float64], width: NDArray[np.float64], label: str
 ) -> Panel:
     """Returns a panel with values (m,) and their intervals over the time or the number of the pose."""
     x = _x(result)
@@ -168,4 +138,4 @@ def _panel(
     marks: list[Mark] = [Guide("y", 0.0, None, NEUTRAL, dashed=False)]
     marks.append(Band("95 % interval", x, values - width, values + width, HELD_OUT))
     marks.append(Curve("estimate", x, values, FITTED, "circles" if result.t is None else "line"))
-    return Panel(title, marks, x_label if last else "", label, height=150, x_ticks=last)
+    return Panel(title, marks, x_label, label, height=150)

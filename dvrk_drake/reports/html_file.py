@@ -8,10 +8,16 @@ cursor. Plotly, plots and 3D views are compressed.
 from __future__ import annotations
 
 import gzip
+import hashlib
 import json
+import platform
 import re
+import shlex
 from base64 import b64encode
+from collections.abc import Iterable, Sequence
+from datetime import UTC, datetime
 from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from importlib.resources import files
 from pathlib import Path
 
@@ -20,37 +26,54 @@ from markupsafe import Markup, escape
 from plotly.offline import get_plotlyjs
 
 from dvrk_drake.errors import DvrkDrakeError
-from dvrk_drake.models.files import atomic_write
+from dvrk_drake.models.files import atomic_write, open_input
 from dvrk_drake.reports.colours import DARK
-from dvrk_drake.reports.page import Command, Page, Plot, Scene, Section, Table, Text, Verdict, cell_text
+from dvrk_drake.reports.page import Page, Plot, Scene, Table, Text, Verdict, cell_text
 from dvrk_drake.reports.plotly_figures import plotly_figure
-from dvrk_drake.reports.provenance import Provenance
 
 
-def write_html(page: Page, path: str | Path, provenance: Provenance) -> None:
-    """Writes a page atomically.
+def write_html(page: Page, path: str | Path, inputs: Iterable[str | Path] = (), command: Sequence[str] = ()) -> None:
+    """Writes a page atomically. Its provenance states inputs, versions, command and date.
 
     Args:
         page: Page.
         path: File to write.
-        provenance: Files, versions and command of the page.
+        inputs: Input files. The page states their SHA-256. A folder, e.g. with a bag, has none.
+        command: Words of the command line without the name of the program, e.g. `sys.argv[1:]`. Empty: no command.
 
     Raises:
         DvrkDrakeError: The file cannot be written.
     """
-    text = render_html(page, provenance)
+    text = render_html(page, inputs, command)
     with atomic_write(path) as stream:
         stream.write(text)
 
 
-def render_html(page: Page, provenance: Provenance) -> str:
+def render_html(page: Page, inputs: Iterable[str | Path] = (), command: Sequence[str] = ()) -> str:
     """Returns a page as HTML. It contains all scripts and styles. The arguments are those of `write_html`."""
-    sections = list(page.sections)
-    if page.next_step:
-        is_command = page.next_step.startswith("dvrk-drake ")
-        block = Command(page.next_step, page.next_purpose) if is_command else Text(page.next_step)
-        sections.append(Section("Next step", [block]))
-    return _environment().get_template("page.html").render(page=page, sections=sections, provenance=provenance)
+    versions = [f"{name} {_version(name)}" for name in ("dvrk-drake", "drake", "numpy")]
+    provenance = [
+        *((str(path), _sha256(path)) for path in inputs),
+        ("versions", ", ".join([*versions, f"Python {platform.python_version()}"])),
+        ("command", shlex.join(["dvrk-drake", *command]) if command else "written from Python"),
+        ("date", datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")),
+    ]
+    return _environment().get_template("page.html").render(page=page, provenance=provenance)
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def _sha256(path: str | Path) -> str:
+    try:
+        with open_input(path, DvrkDrakeError) as file:
+            return f"SHA-256 {hashlib.file_digest(file, 'sha256').hexdigest()}"
+    except DvrkDrakeError:
+        return "not a regular file"
 
 
 def _scene(block: Scene) -> tuple[str, str]:
@@ -109,6 +132,6 @@ def _environment() -> Environment:
         "packed": _packed,
         "figure": lambda plot: str(plotly_figure(plot).to_json()),
     }
-    for kind in (Text, Table, Plot, Scene, Command, Verdict):
+    for kind in (Text, Table, Plot, Scene, Verdict):
         environment.tests[kind.__name__.lower()] = lambda block, kind=kind: isinstance(block, kind)
     return environment

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -27,9 +29,9 @@ from dvrk_drake.reports.efforts import (
     residuals_plot,
     structure_table,
 )
-from dvrk_drake.reports.page import Block, Level, Page, Scene, Section, Table, Text, Verdict
+from dvrk_drake.reports.page import Block, Cell, Level, Page, Scene, Section, Table, Text, Verdict, warning_texts
 from dvrk_drake.reports.parameters import parameter_blocks
-from dvrk_drake.reports.plot import length_unit
+from dvrk_drake.reports.playback import playback
 
 #: Level of each verdict. "off" and "not judged" have no colour.
 LEVELS: dict[VerdictWord, Level] = {
@@ -69,8 +71,9 @@ def identification_page(
         seconds = sum(own.x[-1] - own.x[0] for own in every)
         what = f"motion of {seconds:.0f} s" if not others else f"{len(every)} motions, {seconds:.0f} s"
     task = "validation" if isinstance(result, Validation) else "identification"
+    verdicts = result.verdicts if isinstance(result, Validation) else cross_validated_verdicts(result.model)
     sections = [
-        Section("Verdict per joint", [*_errors(result, efforts), *_remarks(result)]),
+        Section("Verdict per joint", [*_errors(result, efforts, verdicts), *_remarks(result, verdicts)]),
         *_effort_sections(efforts, "" if not others else names.split(", ")[0], ""),
     ]
     for k, own in enumerate(others, 2):
@@ -98,83 +101,93 @@ def _num_recordings(result: Result) -> int:
     return len(result.motions) if isinstance(result, DynamicIdentification) else 1
 
 
-def _errors(result: Result, efforts: Efforts) -> list[Block]:
+def _errors(result: Result, efforts: Efforts, verdicts: Mapping[str, VerdictWord]) -> list[Block]:
     """Returns the table of verdicts and errors, with the errors of other models beside them."""
     if isinstance(result, DynamicIdentification):
-        return _identified_motion(result, efforts)
+        return _identified_motion(result, efforts, verdicts)
     if isinstance(result, StaticIdentification):
-        return _identified_poses(result, efforts)
+        return _identified_poses(result, efforts, verdicts)
     if isinstance(result, DynamicValidation):
-        return _validated_motion(result, efforts)
+        return _validated_motion(result, efforts, verdicts)
     assert isinstance(result, StaticValidation)
-    return _validated_poses(result, efforts)
+    return _validated_poses(result, efforts, verdicts)
 
 
-def _label(verdict: VerdictWord) -> Verdict:
-    return Verdict(verdict, LEVELS[verdict])
-
-
-def _ratio(error: float, effort: float) -> str:
-    return f"{error / effort:.2f}" if effort > 0 else ""
-
-
-def _baseline_ratios(efforts: Efforts) -> dict[str, NDArray[np.float64]]:
-    """Returns the relative errors (n,) of other models [1], 0 for a joint without an effort."""
-    effort = efforts.rms(efforts.measured)
-    ratios = {}
-    for name in efforts.baselines:
-        error = efforts.rms_of_baseline(name)
-        ratios[f"{name} error"] = np.divide(error, effort, out=np.zeros_like(error), where=effort > 0)
-    return ratios
-
-
-def _table(header: Sequence[str], rows: Sequence[Sequence], caption: str, zero_torque: str) -> Table:
+def _verdict_table(
+    verdicts: Mapping[str, VerdictWord], columns: Mapping[str, Sequence[str]], caption: str, zero_torque: str
+) -> Table:
     """Returns a table with one row per joint, without empty columns.
 
     Args:
-        header: Headings of the columns after the joint and its verdict.
-        rows: Cells of all columns.
+        verdicts: Verdict of each joint.
+        columns: Heading -> cells of the joints. A further cell is the mean of the joints.
         caption: Caption.
         zero_torque: Relative error of zero torque as text.
     """
-    kept = [k for k in range(2 + len(header)) if k < 2 or any(row[k] != "" for row in rows)]
-    header, rows = [header[k - 2] for k in kept[2:]], [[row[k] for k in kept] for row in rows]
+    columns = {heading: cells for heading, cells in columns.items() if any(cells)}
+    labels = [Verdict(word, LEVELS[word]) for word in verdicts.values()]
+    has_mean = any(len(cells) > len(verdicts) for cells in columns.values())
+    names = [*verdicts, *(["mean"] if has_mean else [])]
     note = ""
-    if "SDF error" in header:
+    if "SDF error" in columns:
         note = (
             "SDF error: relative error of the nominal model, which consists of the SDF and the arm file. Zero torque "
             f"has a relative error of {zero_torque}."
         )
-    right = [False, False, *len(header) * [True]]
-    return Table(("joint", "verdict", *header), rows, caption, note, right=right)
+    every: list[Sequence[Cell]] = [names, labels, *columns.values()]
+    rows = list(zip_longest(*every, fillvalue=""))
+    return Table(("joint", "verdict", *columns), rows, caption, note)
 
 
-def _identified_motion(result: DynamicIdentification, efforts: Efforts) -> list[Block]:
-    section, verdicts = result.model.dynamic_model.section, cross_validated_verdicts(result.model)
-    others = _baseline_ratios(efforts)
-    errors = ("rms_cross_validation", "rms_fit", "rms_repeatability")
-    rows, moved = [], []
-    for j, a in enumerate(section.actuators):
-        shares = [getattr(a, which) / a.rms_effort if a.rms_effort > 0 else 0.0 for which in errors]
-        shares += [float(ratio[j]) for ratio in others.values()]
-        if a.rms_effort > 0:
-            moved.append(shares)
-        cells = (percent(share) if share > 0 else "" for share in shares)
-        rows.append((a.name, _label(verdicts[a.name]), f"{a.rms_effort:.4f}", *cells))
-    means = np.mean(moved, axis=0) if moved else np.zeros(3 + len(others))
-    rows.append(("mean", "", "", *(percent(mean) if mean > 0 else "" for mean in means)))
+def _numbers(values: Iterable[float]) -> list[str]:
+    return [f"{value:.4f}" for value in values]
+
+
+def _ratios(errors: Iterable[float], efforts: Iterable[float]) -> list[str]:
+    """Returns relative errors as text, "" for a joint without an effort."""
+    return [f"{error / effort:.2f}" if effort > 0 else "" for error, effort in zip(errors, efforts, strict=True)]
+
+
+def _relative(errors: Iterable[float], efforts: Iterable[float]) -> list[str]:
+    """Returns relative errors in percent and their mean, "" for a joint without an effort or with an unknown error."""
+    pairs = zip(errors, efforts, strict=True)
+    return _percents([error / effort if effort > 0 and error > 0 else None for error, effort in pairs])
+
+
+def _percents(shares: Sequence[float | None]) -> list[str]:
+    """Returns shares as text in percent, and their mean. A share that is None is unknown, and its text is ""."""
+    known = [share for share in shares if share is not None]
+    mean = float(np.mean(known)) if known else None
+    return ["" if share is None else percent(share) for share in (*shares, mean)]
+
+
+def _baselines(
+    efforts: Efforts, relative: Callable[[Iterable[float], Iterable[float]], list[str]]
+) -> dict[str, list[str]]:
+    """Returns the relative errors of other models by heading."""
+    measured = efforts.rms(efforts.measured)
+    return {f"{name} error": relative(efforts.rms_of_baseline(name), measured) for name in efforts.baselines}
+
+
+def _identified_motion(
+    result: DynamicIdentification, efforts: Efforts, verdicts: Mapping[str, VerdictWord]
+) -> list[Block]:
+    section = result.model.dynamic_model.section
+    effort = [a.rms_effort for a in section.actuators]
+    columns = {
+        "effort [N m; N]": _numbers(effort),
+        "cross-validation error": _relative([a.rms_cross_validation for a in section.actuators], effort),
+        "fit error": _relative([a.rms_fit for a in section.actuators], effort),
+        "repeatability": _relative([a.rms_repeatability for a in section.actuators], effort),
+        **_baselines(efforts, _relative),
+    }
     several = f"{len(result.motions)} recordings, " if len(result.motions) > 1 else ""
-    header = ("effort [N m; N]", "cross-validation error", "fit error", "repeatability", *others)
     how = "6 folds over the phase of the motion; effects, base tilt and parameters are estimated anew in each fold"
     if several:
         how = "each recording is predicted by a model of the others, with the mean of their offsets and friction"
+    caption = f"{several}{result.num_rows} rows of motion: actuator effort and relative error (RMS)"
     blocks: list[Block] = [
-        _table(
-            header,
-            rows,
-            f"{several}{result.num_rows} rows of motion: actuator effort and relative error (RMS)",
-            "100 %",
-        ),
+        _verdict_table(verdicts, columns, caption, "100 %"),
         Text(
             f"Low-pass filter of the efforts: {section.signals.effort_cut_off:g} Hz. Cross-validation: {how}. On "
             "another recording the error can be larger, because friction changes from day to day. Repeatability: "
@@ -184,7 +197,7 @@ def _identified_motion(result: DynamicIdentification, efforts: Efforts) -> list[
         ),
     ]
     if several:
-        blocks += _error_of_each_recording(result)
+        blocks.append(_error_of_each_recording(result))
     tilt = np.degrees(_angle(np.array(section.gravity), np.array(section.gravity_expected)))
     if tilt > 0.1:
         gravity = ", ".join(f"{x:.3f}" for x in section.gravity)
@@ -192,56 +205,58 @@ def _identified_motion(result: DynamicIdentification, efforts: Efforts) -> list[
     return blocks
 
 
-def _error_of_each_recording(result: DynamicIdentification) -> list[Block]:
+def _error_of_each_recording(result: DynamicIdentification) -> Table:
+    """Returns the relative errors of each recording. Those of a joint without an effort are not finite."""
     names = [_name(motion.recording) for motion in result.motions]
-    errors = np.column_stack([motion.held_out_errors for motion in result.motions])
-    rows = [
-        (name, *(percent(error) if np.isfinite(error) else "" for error in row))
-        for name, row in zip(result.model.arm.joint_names, errors, strict=True)
-    ]
-    rows.append(("mean", *map(percent, np.nanmean(errors, axis=0))))
+    columns = (
+        _percents([float(error) if np.isfinite(error) else None for error in motion.held_out_errors])
+        for motion in result.motions
+    )
+    rows = list(zip((*result.model.arm.joint_names, "mean"), *columns, strict=True))
     caption = "Relative error of each recording, predicted by a model of the others"
     note = f"The intervals include only the differences between these {len(names)} recordings."
-    return [Table(("", *names), rows, caption, note, right=[False, *len(names) * [True]])]
+    return Table(("", *names), rows, caption, note)
 
 
-def _identified_poses(result: StaticIdentification, efforts: Efforts) -> list[Block]:
-    verdicts, others = cross_validated_verdicts(result.model), _baseline_ratios(efforts)
-    rows, details = [], []
-    for j, own in enumerate(result.model.joints):
-        torque, error = own.rms_zero_torque_included, own.rms_cross_validation_included
-        rows.append(
-            (
-                own.name,
-                _label(verdicts[own.name]),
-                *(f"{torque:.4f}", f"{error:.4f}", _ratio(error, torque)),
-                *(f"{ratio[j]:.2f}" for ratio in others.values()),
-                *(f"{own.feedforward_scale:.2f}", f"{100 * own.coverage:.0f} %"),
-            )
-        )
+def _identified_poses(
+    result: StaticIdentification, efforts: Efforts, verdicts: Mapping[str, VerdictWord]
+) -> list[Block]:
+    joints, poses = result.model.joints, len(result.recording)
+    torque, error = (
+        [getattr(own, name) for own in joints] for name in ("rms_zero_torque_included", "rms_cross_validation_included")
+    )
+    columns = {
+        "effort": _numbers(torque),
+        "error": _numbers(error),
+        "ratio": _ratios(error, torque),
+        **_baselines(efforts, _ratios),
+        "feedforward scale": [f"{own.feedforward_scale:.2f}" for own in joints],
+        "range covered": [f"{100 * own.coverage:.0f} %" for own in joints],
+    }
+    details = []
+    for own in joints:
         errors = (own.rms_fit_included, own.rms_leave_one_out_included)
         with_excluded = (own.rms_zero_torque, own.rms_fit, own.rms_leave_one_out)
         positions = f"{own.position_lower:+.2f}..{own.position_upper:+.2f}"
-        details.append((own.name, *(f"{e:.4f}" for e in (*errors, *with_excluded)), positions))
-    poses = len(result.recording)
-    header = ("effort", "error", "ratio", *others, "feedforward scale", "range covered")
+        details.append((own.name, *_numbers((*errors, *with_excluded)), positions))
     fits = ("", "fit", "leave-one-out", "zero torque*", "fit*", "leave-one-out*", "positions [rad; m]")
+    caption = f"{poses} static poses: RMS joint effort, cross-validation error [N m; N] and ratio"
     blocks: list[Block] = [
-        _table(header, rows, f"{poses} static poses: RMS joint effort, cross-validation error [N m; N] and ratio", "1"),
+        _verdict_table(verdicts, columns, caption, "1"),
         Text(
             "Cross-validation error: 10 folds over the poses. Effects, parameters and feedforward scales are estimated "
             "anew in each fold. The effort is the error of zero torque.",
             show="details",
         ),
-        Table(fits, details, "RMS error [N m; N] (* including the excluded measurements)", show="details"),
+        Table(fits, details, "RMS error [N m; N] (* including the excluded measurements)", show="details", folded=True),
     ]
-    if count := sum(joint.num_excluded for joint in result.model.joints):
+    if count := sum(joint.num_excluded for joint in joints):
         text = f"{count} of {result.usable.size} measurements were excluded."
         blocks += [Text(f"{text} --verbose lists them.", show="brief"), Text(text, show="details")]
     if poses < result.num_rows:
         text = f"The {result.num_rows} rows contain {poses} distinct poses. Samples of one pose were averaged."
         blocks.append(Text(text))
-    for own in result.model.joints:
+    for own in joints:
         if own.feedforward_scale == 0.0:
             why = "the recording does not separate gravity from friction."
             if own.rms_zero_torque == 0.0:
@@ -250,18 +265,23 @@ def _identified_poses(result: StaticIdentification, efforts: Efforts) -> list[Bl
     return blocks
 
 
-def _validated_motion(validation: DynamicValidation, efforts: Efforts) -> list[Block]:
-    others, rows = _baseline_ratios(efforts), []
-    for j, a in enumerate(validation.actuators):
-        shares = (a.relative_error, a.repeatability, a.inside, a.inside_other_day)
-        cells = [*("" if x is None else percent(x) for x in shares), *(percent(ratio[j]) for ratio in others.values())]
-        rows.append((a.name, _label(a.verdict), f"{a.rms_effort:.4f}", f"{a.rms_error:.4f}", *cells))
-    means = [percent(float(np.mean(ratio[ratio > 0]))) if np.any(ratio > 0) else "" for ratio in others.values()]
-    rows.append(("mean", "", "", "", percent(validation.mean_relative_error), "", "", "", *means))
-    header = ("effort", "error", "ratio", "repeatability", "inside", "other day", *others)
-    name = _name(validation.recording)
+def _validated_motion(
+    validation: DynamicValidation, efforts: Efforts, verdicts: Mapping[str, VerdictWord]
+) -> list[Block]:
+    actuators, n = validation.actuators, len(validation.actuators)
+    columns = {
+        "effort": _numbers(a.rms_effort for a in actuators),
+        "error": _numbers(a.rms_error for a in actuators),
+        "ratio": _percents([a.relative_error for a in actuators]),
+        # Only errors have a mean.
+        "repeatability": _percents([a.repeatability for a in actuators])[:n],
+        "inside": _percents([a.inside for a in actuators])[:n],
+        "other day": _percents([a.inside_other_day for a in actuators])[:n],
+        **_baselines(efforts, _relative),
+    }
+    caption = f"Motion of {_name(validation.recording)}: RMS actuator effort and error [N m; N], relative error"
     return [
-        _table(header, rows, f"Motion of {name}: RMS actuator effort and error [N m; N], relative error", "100 %"),
+        _verdict_table(verdicts, columns, caption, "100 %"),
         Text(
             "inside: share of the measured efforts inside the prediction interval of the same day. other day: inside "
             f"the interval of another day. {validation.model.interval_scope}",
@@ -271,34 +291,42 @@ def _validated_motion(validation: DynamicValidation, efforts: Efforts) -> list[B
     ]
 
 
-def _validated_poses(validation: StaticValidation, efforts: Efforts) -> list[Block]:
-    others, rows, every = _baseline_ratios(efforts), [], []
-    for j, own in enumerate(validation.joints):
-        numbers = (f"{own.rms_torque_included:.4f}", f"{own.rms_error_included:.4f}")
-        ratio = _ratio(own.rms_error_included, own.rms_torque_included)
-        ratios = (f"{other[j]:.2f}" for other in others.values())
-        rows.append((own.name, _label(own.verdict), *numbers, ratio, *ratios, f"{own.num_excluded or ''}"))
-        all_ratio = "" if own.relative_error is None else f"{own.relative_error:.2f}"
-        every.append((own.name, f"{own.rms_torque:.4f}", f"{own.rms_error:.4f}", all_ratio))
-    name, header = _name(validation.recording), ("effort", "error", "ratio", *others, "excluded")
+def _validated_poses(
+    validation: StaticValidation, efforts: Efforts, verdicts: Mapping[str, VerdictWord]
+) -> list[Block]:
+    torque, error = (
+        [getattr(own, name) for own in validation.joints] for name in ("rms_torque_included", "rms_error_included")
+    )
+    columns = {
+        "effort": _numbers(torque),
+        "error": _numbers(error),
+        "ratio": _ratios(error, torque),
+        **_baselines(efforts, _ratios),
+        "excluded": [f"{own.num_excluded or ''}" for own in validation.joints],
+    }
+    caption = f"{validation.poses} poses of {_name(validation.recording)}: RMS joint effort and error [N m; N], ratio"
     blocks: list[Block] = [
-        _table(header, rows, f"{validation.poses} poses of {name}: RMS joint effort and error [N m; N], ratio", "1"),
+        _verdict_table(verdicts, columns, caption, "1"),
         Text(rule_text(), show="details"),
     ]
     if validation.excluded:
+        every = [
+            (own.name, *_numbers((own.rms_torque, own.rms_error)), *_ratios([own.rms_error], [own.rms_torque]))
+            for own in validation.joints
+        ]
         caption = "RMS effort and error [N m; N], all measurements"
-        blocks.append(Table(("", "effort", "error", "ratio"), every, caption, show="details"))
+        blocks.append(Table(("", "effort", "error", "ratio"), every, caption, show="details", folded=True))
     return blocks
 
 
-def _remarks(result: Result) -> list[Block]:
+def _remarks(result: Result, verdicts: Mapping[str, VerdictWord]) -> list[Block]:
     """Returns the joints with a small covered range, the locked joints, and the warnings about the recording."""
     blocks: list[Block] = []
     if isinstance(result, StaticValidation | DynamicValidation):
         judged = result.joints if isinstance(result, StaticValidation) else result.actuators
-        verdicts, covered = result.verdicts, [joint.coverage for joint in judged]
+        covered = [joint.coverage for joint in judged]
     else:
-        verdicts, covered = cross_validated_verdicts(result.model), identified_coverage(result.model).tolist()
+        covered = identified_coverage(result.model).tolist()
     few = [
         name
         for (name, verdict), share in zip(verdicts.items(), covered, strict=True)
@@ -316,11 +344,7 @@ def _remarks(result: Result) -> list[Block]:
                 "warning",
             )
         )
-    for finding in result.warnings:
-        if finding.severity == "warning":
-            text = f"{finding.where}: {finding.what}. {finding.advice}".rstrip()
-            blocks.append(Text(text, "warning", show="page"))
-    return blocks
+    return [*blocks, *warning_texts(result.warnings)]
 
 
 def _effort_sections(efforts: Efforts, name: str, suffix: str) -> list[Section]:
@@ -328,14 +352,14 @@ def _effort_sections(efforts: Efforts, name: str, suffix: str) -> list[Section]:
     of = f": {name}" if name else ""
     views = [] if suffix else [_view(efforts)]
     blocks: list[Block] = [*views, efforts_plot(efforts, f"efforts{suffix}", time=not suffix)]
-    note = (
-        "Predicted: efforts of the model for the positions of this recording."
-        if efforts.judged == "predicted"
-        else "Fitted: model identified from all data. Held out: prediction of a model that was identified without the "
-        "fold of the data that it predicts."
-    )
-    if efforts.v is not None:
-        note += f" {efforts.model.interval_scope}"
+    note = "Predicted: efforts of the model for the positions of this recording."
+    if efforts.judged != "predicted":
+        note = (
+            "Fitted: model identified from all data. Held out: prediction of a model that was identified without the "
+            "fold of the data that it predicts."
+        )
+        if efforts.v is not None:
+            note += f" {efforts.model.interval_scope}"
     causes = "offset, first and second harmonic of the position, load"
     if efforts.v is not None:
         causes = "offset, friction and position of the actuator, accelerations, positions of the other actuators"
@@ -359,48 +383,21 @@ def _effort_sections(efforts: Efforts, name: str, suffix: str) -> list[Section]:
 
 
 def _view(efforts: Efforts) -> Scene:
-    arm = efforts.arm
-
-    def play(t: NDArray[np.float64], q: NDArray[np.float64], tau: NDArray[np.float64]) -> str:
-        from dvrk_drake.reports.playback import playback  # slow to import, and a terminal does not need it
-
-        return playback(arm, t, q, tau)
-
-    if (grid := efforts.grid) is not None:
-        tau = efforts.recording.in_joint_coordinates(arm).measured_effort()
-
-        def html() -> str:
-            on_grid = np.column_stack([np.interp(grid.t, grid.row_times, x) for x in tau.T])
-            return play(grid.t - grid.row_times[0], grid.q, on_grid)
-
-        start = float(grid.t[0] - grid.row_times[0])
-        return Scene(html, "Recorded motion. Click a plot to move the arm to this time.", start)
-    poses = efforts.recording.in_joint_coordinates(arm)
-    caption = "Recorded poses, one per second. Click a plot to show a pose."
-    return Scene(lambda: play(efforts.x, poses.q, poses.measured_effort()), caption, 1.0)
+    arm, recorded = efforts.arm, efforts.recording.in_joint_coordinates(efforts.arm)
+    if (grid := efforts.grid) is None:
+        caption = "Recorded poses. Click a plot to show a pose."
+        html = partial(playback, arm, efforts.x, recorded.q, recorded.measured_effort())
+        return Scene(html, caption, 1.0, len(recorded))
+    tau = np.column_stack([np.interp(grid.t, grid.row_times, x) for x in recorded.measured_effort().T])
+    t = grid.t - grid.row_times[0]
+    caption = "Recorded motion. Click a plot to move the arm to this time."
+    return Scene(partial(playback, arm, t, grid.q, tau), caption, float(t[0]))
 
 
 def _data_quality(result: Result, efforts: Efforts) -> list[Block]:
-    """Returns the covered ranges, the notes on reading, and the rows and measurements that were not used."""
-    arm, recording = result.model.arm, result.recording
-    q = recording.in_joint_coordinates(arm).q
-    rows = []
-    for j, name in enumerate(arm.joint_names):
-        lower, upper = float(q[:, j].min()), float(q[:, j].max())
-        limits = f"{arm.position_lower[j]:.3g} .. {arm.position_upper[j]:.3g}"
-        share = (upper - lower) / (arm.position_upper[j] - arm.position_lower[j])
-        cells = [name, length_unit(arm, j), limits, f"{lower:.3g} .. {upper:.3g}", f"{100 * share:.0f} %"]
-        if efforts.v is not None and efforts.grid is not None:
-            v = efforts.grid.v[:, j]
-            cells += [f"{np.sqrt(np.mean(v**2)):.3g}", f"{np.abs(v).max():.3g}"]
-        rows.append(tuple(cells))
-    speeds = () if efforts.v is None else ("RMS speed [1/s]", "peak speed [1/s]")
-    header = ("joint", "unit", "position limits", "recorded", "covered", *speeds)
-    right = [False, False, *(len(header) - 2) * [True]]
-    blocks: list[Block] = [
-        Table(header, rows, "Positions of the joints in the recording", show="page", right=right),
-        *(Text(f"Reading: {note}", show="page") for note in recording.notes),
-    ]
+    """Returns the notes on reading, and the rows and measurements that were not used."""
+    recording = result.recording
+    blocks: list[Block] = [Text(f"Reading: {note}", show="page") for note in recording.notes]
     if not any(finding.severity == "warning" for finding in result.warnings):
         blocks.append(Text("The check of the recording reported no warnings.", "good", show="page"))
     if efforts.grid is not None:
@@ -433,7 +430,7 @@ def recalibration_page(result: Recalibration, *, model_path: str = "MODEL.yaml",
     header = ("", *errors, *changes, "offset change [N m; N]", "unchanged because")
     caption = f"{result.seconds:.1f} s of motion: effort error, change of friction and offset"
     blocks: list[Block] = [
-        Table(header, rows, caption, right=[False, *5 * [True], False]),
+        Table(header, rows, caption),
         Text(
             "The improvement is valid for similar motions. At other positions and speeds, the improvement can be much "
             "smaller. Validate the new model on the motion that you need."

@@ -74,7 +74,7 @@ def draw_plot(plot: Plot, title: str) -> Figure:
     rows = -(-count // columns)
     heights = plot.row_heights
     # Titles and labels of a panel need about 0.75 inch, and without labels of the x axis 0.35 inch.
-    around = 0.75 if all(panel.x_ticks for panel in plot.panels) else 0.35
+    around = 0.35 if plot.shared_x else 0.75
     height = sum(heights) / DPI * 0.9 + around * rows + 1.0
     figure, axes = plt.subplots(
         rows, columns, figsize=(WIDTH, height), height_ratios=heights, squeeze=False, layout="constrained"
@@ -83,6 +83,9 @@ def draw_plot(plot: Plot, title: str) -> Figure:
         unused.remove()
     for panel, ax in zip(plot.panels, axes.flat, strict=False):
         _draw(ax, panel, loc="left" if columns == 1 else "center", width=110 // columns)
+        if plot.shared_x and panel is not plot.panels[-1]:
+            ax.set_xlabel("")
+            ax.tick_params(labelbottom=False)
     figure.align_ylabels(list(axes.flat[:count]))
     figure.suptitle(textwrap.fill(f"{title}: {plot.caption}", _TITLE_LENGTH))
     _add_legend(figure)
@@ -115,7 +118,6 @@ def _draw(ax: Axes, panel: Panel, loc: Any, width: int) -> None:
         ax.set_yscale("log")
     if not categories and not panel.log_y:
         ax.ticklabel_format(axis="y", useOffset=False)
-    ax.tick_params(labelbottom=panel.x_ticks)
 
 
 def _draw_mark(ax: Axes, mark: Mark) -> None:

@@ -21,7 +21,7 @@ Each text and each table states where it is shown (`Show`). Results do not impor
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -88,7 +88,6 @@ class Table:
         note: Explanation below the table.
         show: Where the table is shown.
         folded: Whether a page shows only the caption until the reader opens the table.
-        right: Whether each column is aligned right. None: columns in which all cells are numbers are.
         name: Name of the CSV file without suffix, if the page is written with its tables.
     """
 
@@ -98,7 +97,6 @@ class Table:
     note: str = ""
     show: Show = "always"
     folded: bool = False
-    right: Sequence[bool] | None = None
     name: str = ""
 
     def __post_init__(self) -> None:
@@ -109,11 +107,10 @@ class Table:
 
     @property
     def aligned_right(self) -> list[bool]:
-        """True for each column that is aligned right."""
-        if self.right is not None:
-            return list(self.right)
-        columns = map(list, zip(*self.rows, strict=True)) if self.rows else ([] for _ in self.header)
-        return [bool(cells) and all(map(_is_number, cells)) for cells in columns]
+        """True for each column that is aligned right: at least half of its filled cells are numbers."""
+        columns = list(zip(*self.rows, strict=True)) or [() for _ in self.header]
+        filled = [[cell for cell in column if str(cell) not in ("", "-")] for column in columns]
+        return [2 * sum(map(_is_number, cells)) >= len(cells) > 0 for cells in filled]
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,6 +123,7 @@ class Plot:
         panels: Panels in reading order.
         columns: Number of columns of panels.
         time: Whether all x axes are the time [s] of the 3D views on the page. The plot then has the time cursor.
+        shared_x: Whether all panels have the same x axis. Its labels are then below the last panel only.
     """
 
     name: str
@@ -133,6 +131,7 @@ class Plot:
     panels: Sequence[Panel]
     columns: int = 1
     time: bool = False
+    shared_x: bool = False
 
     @property
     def row_heights(self) -> list[int]:
@@ -150,27 +149,16 @@ class Scene:
             the page is written, because drawing takes seconds. It may raise a DvrkDrakeError.
         caption: Sentence above the view.
         start: Time [s] on the axes of the plots at which the animation starts.
+        poses: Number of poses, if the animation shows one static pose per second. 0: a motion.
     """
 
     html: Callable[[], str]
-    caption: str = "3D view. Drag to rotate, scroll to zoom."
+    caption: str
     start: float = 0.0
+    poses: int = 0
 
 
-@dataclass(frozen=True)
-class Command:
-    """Command to type, with a button that copies it, only on a page.
-
-    Attributes:
-        command: Command line.
-        purpose: What the command does, in one sentence.
-    """
-
-    command: str
-    purpose: str = ""
-
-
-Block = Text | Table | Plot | Scene | Command
+Block = Text | Table | Plot | Scene
 
 
 @dataclass(frozen=True)
@@ -221,9 +209,13 @@ class Page:
         return (block for section in self.sections for block in section.blocks)
 
 
+def warning_texts(findings: Iterable[object]) -> list[Text]:
+    """Returns the warnings about a recording as texts that only a page shows, because commands print them on stderr."""
+    found = [str(finding) for finding in findings]
+    return [Text(one.removeprefix("warning: "), "warning", show="page") for one in found if one.startswith("warning: ")]
+
+
 def _is_number(cell: Cell) -> bool:
-    """Tells whether a cell is a number, a range, a number with a unit or empty."""
-    if isinstance(cell, Verdict):
-        return False
-    text = str(cell).strip().removeprefix("inf")
-    return not text or text[0].isdigit() or (len(text) > 1 and text[0] in "+-−±<>≥~." and any(map(str.isdigit, text)))
+    """Tells whether a cell is a number, a range or a number with a unit."""
+    text = str(cell).strip()
+    return text == "inf" or text[0].isdigit() or (text[0] in "+-−±<>≥~." and any(map(str.isdigit, text)))

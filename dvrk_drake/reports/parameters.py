@@ -10,7 +10,6 @@ from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor, derive_base_
 from dvrk_drake.dynamics.dynamic_section import DynamicSection
 from dvrk_drake.dynamics.gravity_parameters import gravity_parameters
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.dynamics.inertial_parameters import PARAMETER_NAMES
 from dvrk_drake.dynamics.model_links import nearest_links
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import Arm
@@ -18,7 +17,6 @@ from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 from dvrk_drake.models.effects_schema import DriveEffect, half_width
 from dvrk_drake.reports.page import Block, Cell, Table, Text
 
-_UNITS = dict(zip(PARAMETER_NAMES, ("kg", *3 * ["kg m"], *6 * ["kg m²"]), strict=True))
 #: Largest absolute value that is considered a rounding error [kg, kg m, kg m^2].
 _ROUNDING = 1e-13
 _HEADER = ("estimate", "95 % interval", "SDF", "unit")
@@ -45,7 +43,6 @@ def parameter_blocks(model: IdentifiedModel) -> list[Block]:
         *_rotors(section, regressor),
         *_base_parameters(section, regressor),
         *_correlations(section),
-        _all_link_parameters(section, regressor),
     ]
 
 
@@ -213,18 +210,6 @@ def _effects(
         scales.setdefault(EFFECT_KINDS[kind].scale or "", []).append(kind)
     note = " ".join(f"{', '.join(kinds)}: the scale is the {text}." for text, kinds in scales.items() if text)
     return [_table(header, rows, f"{len(rows)} {what}", note)]
-
-
-def _all_link_parameters(section: DynamicSection, regressor: DynamicRegressor) -> Table:
-    rows: list[tuple[Cell, ...]] = [
-        (link.link, name, *estimate_cells(value, error, section.degrees_of_freedom), _number(sdf), _unit(_UNITS[name]))
-        for link, nominal in zip(section.links, regressor.links, strict=True)
-        for name, value, error, sdf in zip(
-            PARAMETER_NAMES, link.parameters, link.standard_errors or 10 * [0.0], nominal.parameters, strict=True
-        )
-    ]
-    caption = "All inertial parameters of the links, about the origin of the link frame"
-    return Table(("link", "parameter", *_HEADER), rows, caption, show="page", folded=True)
 
 
 def _breakable(name: str) -> str:

@@ -14,7 +14,7 @@ from dvrk_drake.analysis.payload import (
 )
 from dvrk_drake.models.locked_joints import locked_option
 from dvrk_drake.reports.colours import FITTED
-from dvrk_drake.reports.page import Block, Page, Plot, Section, Table, Text
+from dvrk_drake.reports.page import Block, Page, Plot, Section, Table, Text, warning_texts
 from dvrk_drake.reports.plot import Bars, category_panel
 
 
@@ -50,7 +50,7 @@ def payload_page(result: PayloadIdentification, *, model_path: str | None = None
                 "makes them narrower."
             )
         )
-    estimate += [Text(str(warning).removeprefix("warning: "), "warning", show="page") for warning in result.warnings]
+    estimate += warning_texts(result.warnings)
     return Page(
         f"Payload of {arm.name}",
         answer,
@@ -79,7 +79,7 @@ def _estimate_table(payload: Payload) -> Table:
         rows.append((name, f"{value:+.4f}", f"{error:.4f}", f"{value - reach:+.4f}..{value + reach:+.4f}", base))
     header = ("", "estimate", "standard error", f"{100 * CONFIDENCE:.0f} % interval", "base frame, q = 0")
     caption = f"Payload on {payload.link}, position in the frame of the link"
-    return Table(header, rows, caption, right=[False, True, True, True, True])
+    return Table(header, rows, caption)
 
 
 def _link_table(estimates: Sequence[Payload]) -> Table:
@@ -99,7 +99,6 @@ def _link_table(estimates: Sequence[Payload]) -> Table:
         "* whitened RMS error with payload / whitened RMS error without payload, cross-validated over the phase of the "
         "motion. Geometric mean over the actuators.",
         show="details",
-        right=[False, True, True, True, False],
     )
 
 
@@ -118,7 +117,6 @@ def _effort_table(payload: Payload) -> Table:
         "RMS change of the efforts [N m; N]",
         "* after subtraction of the efforts of the payload and of the changes of offsets and friction",
         show="details",
-        right=[False, True, True, True, True],
     )
 
 

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.geometry import MeshcatAnimation, Rgba
 
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.systems.arm_view.drawn_arm import DrawnArm
-from dvrk_drake.systems.arm_view.force_arrow import FORCE_COLOR, FORCE_SCALE, DrawnForce
-from dvrk_drake.systems.arm_view.overlay import ArmOverlay
-from dvrk_drake.systems.arm_view.page import page_html, start_meshcat
+from dvrk_drake.reports.colours import REFERENCE
+
+if TYPE_CHECKING:
+    from dvrk_drake.systems.arm_view.force_arrow import DrawnForce
 
 #: Largest rate [Hz] and largest number of key frames. Meshcat interpolates between key frames.
 MAX_RATE, MAX_FRAMES = 30.0, 400
-#: Name and colour of the second arm: that of the model of the SDF in the plots.
-_GHOST, _GHOST_COLOUR = "ghost", Rgba(0.17, 0.67, 0.4, 0.5)
+_GHOST = "ghost"
 
 
 def frame_times(start: float, end: float) -> NDArray[np.float64]:
@@ -32,6 +31,7 @@ def playback(
     q: NDArray[np.float64],
     tau: NDArray[np.float64] | None = None,
     *,
+    color: str = "",
     ghost: NDArray[np.float64] | None = None,
     forces: Sequence[DrawnForce] | None = None,
     phases: Sequence[tuple[float, str]] = (),
@@ -45,7 +45,8 @@ def playback(
         t: Times (m,) of the poses, increasing [s].
         q: Poses (m, n) of the joints [rad, m].
         tau: Efforts (m, n) of the joints [N m, N]. None: they are not drawn.
-        ghost: Poses (m, n) of a second, translucent arm [rad, m]. None: there is no second arm.
+        color: Colour of the arm as "#rrggbb". "": the colours of its model file.
+        ghost: Poses (m, n) of a second arm [rad, m], translucent in the colour `REFERENCE`. None: there is none.
         forces: External force at each of the m times. None: there is no arrow.
         phases: Start times [s] of the phases, and their names.
         colors: CSS colours and their meanings, see `page_html`.
@@ -55,6 +56,17 @@ def playback(
         ArmError: The arm has no visual geometry.
         DvrkDrakeError: No port of this computer is free.
     """
+    # Slow to import, and a terminal shows no animation.
+    from pydrake.geometry import MeshcatAnimation, Rgba
+
+    from dvrk_drake.systems.arm_view.drawn_arm import DrawnArm
+    from dvrk_drake.systems.arm_view.force_arrow import FORCE_COLOR, FORCE_SCALE
+    from dvrk_drake.systems.arm_view.overlay import ArmOverlay
+    from dvrk_drake.systems.arm_view.page import page_html, start_meshcat
+
+    def rgba(colour: str, opacity: float) -> Rgba:
+        return Rgba(*(int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5)), opacity)
+
     times = frame_times(float(t[0]), float(t[-1]))
     poses, efforts, ghosts = (
         None if values is None else np.column_stack([np.interp(times, t, x) for x in values.T])
@@ -63,9 +75,10 @@ def playback(
     assert poses is not None
     period = float(times[1] - times[0])
     meshcat = start_meshcat(arm)
-    links, overlay = DrawnArm(arm, meshcat, f"{arm.name.lower()}/links"), ArmOverlay(arm, meshcat, trace=False)
+    links = DrawnArm(arm, meshcat, f"{arm.name.lower()}/links", color=rgba(color, 1.0) if color else None)
+    overlay = ArmOverlay(arm, meshcat, trace=False)
     if ghosts is not None:
-        overlay.add_ghost(_GHOST, _GHOST_COLOUR)
+        overlay.add_ghost(_GHOST, rgba(REFERENCE, 0.5))
     nearest = np.abs(np.subtract.outer(times, t)).argmin(axis=1) if forces is not None else None
     meshcat.StartRecording(frames_per_second=1 / period)
     for k, pose in enumerate(poses):

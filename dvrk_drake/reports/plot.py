@@ -112,7 +112,6 @@ class Panel:
         x_range, y_range: Ranges of the axes. None: the range of the marks.
         log_x, log_y: Whether an axis is logarithmic.
         height: Height of the axes on a page [px]. Panels of one row have one height.
-        x_ticks: Whether the x axis has labels. False for panels above others with the same x axis.
     """
 
     title: str
@@ -124,7 +123,6 @@ class Panel:
     log_x: bool = False
     log_y: bool = False
     height: int = 190
-    x_ticks: bool = True
 
     @property
     def categories(self) -> list[str]:

@@ -78,22 +78,24 @@ def plotly_figure(plot: Plot) -> go.Figure:
     count, columns = len(plot.panels), plot.columns
     rows = -(-count // columns)
     heights = plot.row_heights
-    # One gap for all rows, because Plotly supports no other spacing.
-    gap = _GAP if any(panel.x_ticks for panel in plot.panels[:-columns]) else _SMALL_GAP
+    gap = _SMALL_GAP if plot.shared_x else _GAP
     top = _TOP + _LEGEND_LINE * _legend_lines(plot)
     inside = sum(heights) + gap * (rows - 1)
     figure = make_subplots(
         rows=rows,
         cols=columns,
         row_heights=heights,
-        shared_xaxes=gap == _SMALL_GAP,
+        shared_xaxes=plot.shared_x,
         vertical_spacing=gap / inside,
         horizontal_spacing=0.14 / max(columns - 1, 1) if columns > 1 else 0.0,
         subplot_titles=[panel.title for panel in plot.panels],
     )
     names: set[str] = set()
     for k, panel in enumerate(plot.panels):
-        _draw(figure, panel, {"row": k // columns + 1, "col": k % columns + 1}, names)
+        at = {"row": k // columns + 1, "col": k % columns + 1}
+        _draw(figure, panel, at, names)
+        if plot.shared_x and panel is not plot.panels[-1]:
+            figure.update_xaxes(title_text="", showticklabels=False, **at)
     if columns > 1:  # a panel is half as wide, and labels such as -0.005 must not overlap
         figure.update_xaxes(nticks=5, selector=lambda axis: axis.type != "log")
     figure.update_annotations(font_size=13)
@@ -129,7 +131,6 @@ def _draw(figure: go.Figure, panel: Panel, at: dict[str, int], names: set[str]) 
         title_text=panel.x_label,
         type="log" if panel.log_x else None,
         range=_range(panel.x_range, panel.log_x),
-        showticklabels=panel.x_ticks,
         nticks=None if panel.log_x else 8,
         tickangle=0,
         **({"dtick": 1} if panel.log_x else {}),

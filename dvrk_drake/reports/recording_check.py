@@ -94,8 +94,7 @@ def _joint_table(report: RecordingReport) -> Table:
         cells += [_number(joint.effort, "{:.4f}"), _number(joint.peak_effort, "{:.0f} %", 1e2)]
         rows.append((joint.name, *cells, *([_number(joint.floor, "{:.1f} %", 1e2)] if is_periodic else [])))
     header += ["repeatability"] if is_periodic else []
-    right = [k > 0 for k in range(len(header))]
-    return Table(header, rows, "Positions and efforts of the joints", right=right)
+    return Table(header, rows, "Positions and efforts of the joints")
 
 
 def _signals(report: RecordingReport) -> list[Block]:
@@ -122,7 +121,7 @@ def _signals(report: RecordingReport) -> list[Block]:
         )
     header = ("", "v RMS", "vd RMS", "qd / dq/dt", "qd delay", "tau delay", "work", "tau cut-off", "qd cut-off")
     caption = "Signals of the actuators [rad, m, s; delays in ms, cut-offs in Hz]"
-    return [Table(header, rows, caption, note, show="details", right=[k > 0 for k in range(9)])]
+    return [Table(header, rows, caption, note, show="details")]
 
 
 def _spectra(report: RecordingReport, recording: Recording, arm: Arm) -> Plot:

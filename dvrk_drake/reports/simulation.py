@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from dvrk_drake.experiments.simulation import Simulation
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.reports.colours import COMMANDED, LIMIT, MEASURED, NEUTRAL, REFERENCE
-from dvrk_drake.reports.page import Block, Page, Plot, Section, Table
+from dvrk_drake.reports.page import Page, Plot, Section, Table
 from dvrk_drake.reports.plot import Curve, Guide, Mark, Panel, effort_unit, joint_label, length_unit
 
 #: Smallest range of a position axis and of an error axis [rad]; a tenth of it in m. Smaller ranges would magnify the
@@ -34,24 +34,17 @@ def simulation_page(simulation: Simulation, arm: Arm, *, scenario: str | None = 
     what = "Largest motion from the start" if desired is None else "Largest tracking error"
     kind = "motion" if desired is None else "error"
     unit = length_unit(arm, j)
-    rows, details = [], []
+    rows = []
     for i, name in enumerate(arm.joint_names):
         share = f"{100 * effort[i] / arm.effort_limits[i]:.0f} %"
         rows.append((name, f"{error[:, i].max():.5f}", f"{error[-1, i]:.5f}", f"{effort[i]:.4f}", share))
-        q = recording.q[:, i]
-        details.append((name, f"{q[0]:z.4f}", f"{q[-1]:z.4f}", f"{arm.effort_limits[i]:.4f}"))
     title = f"{arm.name}, simulated for {simulation.time[-1]:g} s"
     header = ("", f"largest {kind}", f"{kind} at the end", "largest effort", "effort / limit")
-    positions = "Positions [rad; m] and effort limits [N m; N]"
-    blocks: list[Block] = [
-        Table(header, rows, f"{title} [rad, N m; m, N if prismatic]"),
-        Table(("", "start", "end", "effort limit"), details, positions, show="details"),
-        _plot(simulation, arm),
-    ]
+    table = Table(header, rows, f"{title} [rad, N m; m, N if prismatic]")
     return Page(
         title,
         f"{what} {error[:, j].max():.2g} {unit} ({arm.joint_names[j]}), at the end {error[-1, j]:.2g} {unit}.",
-        [Section("Joints", blocks)],
+        [Section("Joints", [table, _plot(simulation, arm)])],
         "good",
         f"dvrk-drake simulate {scenario} --plots FOLDER" if scenario else "",
     )

@@ -13,7 +13,7 @@ from dvrk_drake.experiments.study.table import Row, Share, Summary, summarise, v
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.reports.colours import SERIES
 from dvrk_drake.reports.page import Block, Page, Plot, Section, Table, Text
-from dvrk_drake.reports.plot import Bars, Curve, Panel, category_panel
+from dvrk_drake.reports.plot import Curve, Panel
 
 #: Maximum number of variations in the answer, and of failed runs that a terminal lists without --verbose.
 _MAX_COUNT = 3
@@ -50,14 +50,14 @@ def study_page(study: Study, rows: Mapping[int, Row], *, study_path: str | None 
         blocks.append(Text(text, "warning", show="details" if k >= _MAX_COUNT else "always", unwrapped=True))
     if len(failed) > _MAX_COUNT:
         blocks.append(Text(f"{len(failed)} runs failed. --verbose lists all.", "warning", show="brief"))
-    panels = [_panel(measure, study, rows, summaries) for measure in study.measures]
+    panels = [_panel(measure, study, rows) for measure in study.measures if not measure.is_boolean]
     caption = f"Results of {len(rows)} runs. Cumulative shares are better if they rise further left"
     return Page(
         f"Study of {study.arm.name}, scenario {study.scenario}",
         f"{first.column} {found}. {len(rows)} of {len(study.cases)} runs, {len(failed)} failed.",
         [
             Section("Results", blocks),
-            Section("Distributions", [Plot("study", caption, panels, columns=min(2, len(panels)))]),
+            *([Section("Distributions", [Plot("study", caption, panels, min(2, len(panels)))])] if panels else []),
         ],
         "warning" if failed else "good",
         f"dvrk-drake simulate study {study_path} --output RESULTS.csv --plots FOLDER" if study_path else "",
@@ -95,9 +95,7 @@ def _cells(measure: Measure, summary: Summary, arm: Arm) -> list[str]:
     ]
 
 
-def _panel(measure: Measure, study: Study, rows: Mapping[int, Row], summaries: Sequence[Summary]) -> Panel:
-    if measure.is_boolean:
-        return _share_panel(measure, summaries)
+def _panel(measure: Measure, study: Study, rows: Mapping[int, Row]) -> Panel:
     curves, smallest, infinite = [], math.inf, 0
     for i, variation in enumerate(study.variations):
         cases = [c for c in study.cases if c.variation == variation.name and c.index in rows]
@@ -115,7 +113,9 @@ def _panel(measure: Measure, study: Study, rows: Mapping[int, Row], summaries: S
         curves.append(Curve(variation.name, x, y, SERIES[i % len(SERIES)], "step", texts))
     unit = measure.unit(study.arm)
     return Panel(
-        _title(measure) + (f", {infinite} of {len(rows)} are infinite" if infinite else ""),
+        measure.title[0].upper()
+        + measure.title[1:]
+        + (f", {infinite} of {len(rows)} are infinite" if infinite else ""),
         curves,
         f"{measure.kind.replace('_', ' ')} [{unit}]" if unit else "effort / effort limit [1]",
         "cumulative share of runs [%]",
@@ -123,18 +123,3 @@ def _panel(measure: Measure, study: Study, rows: Mapping[int, Row], summaries: S
         log_x=bool(unit) and 0 < smallest < math.inf,
         height=240,
     )
-
-
-def _share_panel(measure: Measure, summaries: Sequence[Summary]) -> Panel:
-    bars = []
-    for i, summary in enumerate(summaries):
-        share = summary.measures[measure.column]
-        assert isinstance(share, Share)
-        value, low, high = (100 * x for x in (share.count / share.runs, share.lower, share.upper))
-        text = f"{value:.1f} %, 95 % interval {low:.1f}..{high:.1f} %"
-        bars.append(Bars("", [summary.variation], [value], SERIES[i % len(SERIES)], [text]))
-    return category_panel(_title(measure), bars, "share of runs [%]", x_range=(0.0, 103.0))
-
-
-def _title(measure: Measure) -> str:
-    return measure.title[0].upper() + measure.title[1:]

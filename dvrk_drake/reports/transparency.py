@@ -65,15 +65,15 @@ def forces_plot(forces: Sequence[OperatorForces]) -> Plot:
     """Returns the magnitudes of force and torque over time, after the initial transient of the grasp."""
     panels = []
     quantities = (("force", "N", 1.0), ("torque", "mN m", 1e3))
-    for row, (quantity, unit, scale) in enumerate(quantities):
+    for quantity, unit, scale in quantities:
         curves = []
         for i, one in enumerate(forces):
             late = one.time >= GRASP_TIME
-            size = scale * np.linalg.norm((one.force, one.torque)[row][late], axis=1)
+            size = scale * np.linalg.norm(getattr(one, quantity)[late], axis=1)
             curves.append(Curve(_name(one, forces), one.time[late], size, **series(i)))
-        panels.append(Panel("", curves, "time [s]" if row else "", f"{quantity} [{unit}]", height=220, x_ticks=row > 0))
+        panels.append(Panel("", curves, "time [s]", f"{quantity} [{unit}]", height=220))
     caption = f"Magnitude of interaction force and torque at the handle, from {GRASP_TIME:g} s on"
-    return Plot("transparency", caption, panels)
+    return Plot("transparency", caption, panels, shared_x=True)
 
 
 def write_transparency(path: Path, forces: Sequence[OperatorForces]) -> None:

@@ -9,7 +9,6 @@ from typing import Any
 
 from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.reports.html_file import write_html
-from dvrk_drake.reports.provenance import Provenance
 
 #: Mapping from the name of a result's class to the module of its page and the function in it that returns the page:
 #: `function(result) -> Page`. Modules are imported when they are needed.
@@ -58,4 +57,4 @@ def write_report(
         raise DvrkDrakeError(f"there is no report for {name}; allowed: {', '.join(sorted(_MAKERS))}")
     module, function = _MAKERS[name]
     page = getattr(import_module(f"dvrk_drake.reports.{module}"), function)(result)
-    write_html(page, path, Provenance.of(inputs, command))
+    write_html(page, path, inputs, command)

@@ -41,7 +41,6 @@ from dvrk_drake.reports.colours import MEASURED
 from dvrk_drake.reports.image_files import write_images
 from dvrk_drake.reports.page import Page, Plot, Section, Table, Text
 from dvrk_drake.reports.plot import Curve, Panel
-from dvrk_drake.reports.provenance import Provenance
 from dvrk_drake.reports.reproduction import drift
 from dvrk_drake.reports.reproduction import page as reproduction_page
 from dvrk_drake.reports.reproduction.drift import reproduce_figure_5, share
@@ -152,7 +151,7 @@ def test_page_links_its_tables_and_figures(tmp_path):
     table = Table(("", "J1"), (("ours", "1"), ("theirs", "a, b")), "Numbers", name="numbers")
     plot = Plot("x", "Seen", [Panel("", [Curve("", [0, 1], [0, 1], MEASURED)], "q [rad]", "tau [N m]")])
     section = Section("Fig. 9: a, b", [Text("Found."), table, plot, Text("**Said** `so`.")])
-    write_page(tmp_path, [section], ["a reason"], Provenance.of())
+    write_page(tmp_path, [section], ["a reason"])
     text = (tmp_path / "index.html").read_text()
     assert '<a href="#section-2">Fig. 9: a, b</a>' in text
     assert "<figcaption>Seen</figcaption>" in text and (tmp_path / "x.png").read_bytes().startswith(b"\x89PNG")
@@ -279,7 +278,7 @@ def exact_session(truth, folder, executor, sample_sizes):
     q = ARM.sample_poses(20, np.random.default_rng(9))
     poses = Recording(q=q, tau=truth.exact.holding_torque(q), source="computed")
     session = ReproductionSession(folder, PaperRecordings(None), executor, sample_sizes=sample_sizes)
-    session.__dict__["mtm"] = IdentifiedArm(truth.arm, truth.origin, poses, truth.exact)
+    session.__dict__["mtm"] = IdentifiedArm(truth.arm, poses, truth.exact)
     return session
 
 
@@ -288,7 +287,7 @@ def test_figure_5_writes_files_and_exact_model_holds(truth, tmp_path):
     sample_sizes = SampleSizes(releases=3, few_releases=2, duration=1.0)
     with ThreadPoolExecutor(1) as executor:
         section = reproduce_figure_5(exact_session(truth, tmp_path, executor, sample_sizes))
-    write_page(tmp_path, [section], [], Provenance.of())
+    write_page(tmp_path, [section], [])
     page = (tmp_path / "index.html").read_text()
     tables, plots = ([block for block in section.blocks if isinstance(block, kind)] for kind in (Table, Plot))
     assert len(plots) == 2

@@ -5,8 +5,10 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from dvrk_drake.reports.colours import ROLES, SERIES
+from dvrk_drake.reports import colours
+from dvrk_drake.reports.colours import SERIES
 
+ROLES = [value for name, value in vars(colours).items() if name.isupper() and isinstance(value, str)]
 #: Linear RGB of a colour -> linear RGB that a deuteranope sees as the same colour. Machado, Oliveira and
 #: Fernandes (2009), "A physiologically-based model for simulation of color vision deficiency", severity 1.0.
 DEUTERANOPIA = np.array(
@@ -40,9 +42,9 @@ def deuteranope(rgb):
     return np.clip(DEUTERANOPIA @ rgb, 0.0, 1.0)
 
 
-@pytest.mark.parametrize("colours", [tuple(ROLES.values()), SERIES], ids=["roles", "series"])
-def test_all_colours_differ(colours):
-    for one, other in combinations(colours, 2):
+@pytest.mark.parametrize("palette", [ROLES, SERIES], ids=["roles", "series"])
+def test_all_colours_differ(palette):
+    for one, other in combinations(palette, 2):
         a, b = linear_rgb(one), linear_rgb(other)
         assert np.linalg.norm(lab(a) - lab(b)) > SMALLEST_DIFFERENCE, (one, other)
         assert np.linalg.norm(lab(deuteranope(a)) - lab(deuteranope(b))) > SMALLEST_DIFFERENCE, (one, other)

@@ -10,10 +10,9 @@ from report_checks import check_report, printed_text
 
 from dvrk_drake.reports.colours import LIMIT, MEASURED, SERIES
 from dvrk_drake.reports.html_file import write_html
-from dvrk_drake.reports.page import Command, Page, Plot, Scene, Section, Table, Text, Verdict
+from dvrk_drake.reports.page import Page, Plot, Scene, Section, Table, Text, Verdict
 from dvrk_drake.reports.plot import Bars, Curve, Guide, Panel, category_panel
 from dvrk_drake.reports.plotly_figures import plotly_figure
-from dvrk_drake.reports.provenance import Provenance
 from dvrk_drake.systems.arm_view.page import start_meshcat
 
 #: Duration of the animation [s]. The box moves along x with 0.1 m/s.
@@ -36,10 +35,10 @@ def effort_plot():
     """Returns a plot with two panels over time."""
     t = np.linspace(0.0, DURATION, 401)
     panels = [
-        Panel(name, [Curve("measured", t, np.sin(k * t), MEASURED)], "t [s]", "effort [N m]", x_ticks=k == 2)
+        Panel(name, [Curve("measured", t, np.sin(k * t), MEASURED)], "t [s]", "effort [N m]")
         for k, name in ((1, "shoulder"), (2, "elbow"))
     ]
-    return Plot("efforts", "Efforts over time", panels, time=True)
+    return Plot("efforts", "Efforts over time", panels, time=True, shared_x=True)
 
 
 @pytest.fixture(scope="module")
@@ -55,14 +54,13 @@ def report(scene, tmp_path_factory):
         level="warning",
         sections=[
             Section("Verdict per joint", [Table(("joint", "verdict", "error [N m]"), rows, "Error")]),
-            Section("Efforts", [Scene(lambda: scene), effort_plot()]),
+            Section("Efforts", [Scene(lambda: scene, "Box"), effort_plot()]),
             Section("Errors", [Plot("errors", "Errors", [bars]), Text("Note", "warning")], folded=True),
-            Section("Parameters", [Command("dvrk-drake predict")], folded=True),
         ],
         next_step="dvrk-drake validate model.yaml",
         next_purpose="Validates the model.",
     )
-    write_html(page, folder / "report.html", Provenance.of([folder / "poses.csv"], ["identify", "my poses.csv"]))
+    write_html(page, folder / "report.html", [folder / "poses.csv"], ["identify", "my poses.csv"])
     return folder / "report.html"
 
 
@@ -197,9 +195,9 @@ def test_dark_page_has_light_text_and_curves(open_page, report):
 
 
 def test_columns_of_numbers_are_aligned_right():
-    table = Table(("a", "b", "c", "d"), [("joint", 1.5, "-0.2", "3..5 %"), ("1 mm", 2, "12", "")])
+    table = Table(("a", "b", "c", "d"), [("joint", 1.5, "-0.2", "3..5 %"), ("1 mm", 2, "12", ""), ("yaw", 3, "", "-")])
     assert table.aligned_right == [False, True, True, True]
-    assert Table(("a", "b"), [("x", "inf")], right=[False, True]).aligned_right == [False, True]
+    assert Table(("a", "b"), [("x", "inf"), ("", "none"), ("", "-")]).aligned_right == [False, True]
     with pytest.raises(ValueError, match="a row has 1 cells, the header has 2"):
         Table(("a", "b"), [("1",)])
 

@@ -8,11 +8,10 @@ from importlib import import_module
 from importlib.resources import files
 from pathlib import Path
 
-import numpy as np
 import pytest
 from figure_rules import checked_figures
 from loaded_arm import two_days
-from report_checks import ALL_VIEWS, check_report
+from report_checks import ALL_VIEWS, VIEWS, check_report
 from report_results import operator_forces, study_results, tuning_result
 
 import dvrk_drake as dvrk
@@ -27,14 +26,11 @@ from dvrk_drake.reports.html_file import render_html, write_html
 from dvrk_drake.reports.image_files import write_images
 from dvrk_drake.reports.page import Plot, Table
 from dvrk_drake.reports.payload import payload_page
-from dvrk_drake.reports.plot import Bars, Curve, Guide
-from dvrk_drake.reports.provenance import Provenance
+from dvrk_drake.reports.plot import Curve, Guide
 from dvrk_drake.reports.study import study_page
 from dvrk_drake.reports.transparency import transparency_page
 from dvrk_drake.reports.tuning import tuning_page
 from dvrk_drake.reports.write import _MAKERS
-
-ORIGIN = Provenance.of()
 
 
 @cache
@@ -92,7 +88,7 @@ def test_page_has_answer_tables_plots_and_next_step(name, tmp_path, monkeypatch)
     page = PAGES[name]()
     assert page.answer and page.level in ("good", "warning")
     assert blocks(page, Table) and page.next_step.startswith("dvrk-drake ")
-    assert "--verbose" not in render_html(page, ORIGIN)
+    assert "--verbose" not in render_html(page)
     with checked_figures(monkeypatch):
         assert [path.stem for path in write_images(page, tmp_path)] == [plot.name for plot in blocks(page, Plot)] != []
 
@@ -110,18 +106,14 @@ def test_pages_at_all_widths(name, open_page, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("name", PAGES)
 def test_layout_in_a_browser(name, open_page, tmp_path):
-    write_html(PAGES[name](), tmp_path / "report.html", ORIGIN)
-    check_report(open_page, tmp_path / "report.html")
+    write_html(PAGES[name](), tmp_path / "report.html")
+    check_report(open_page, tmp_path / "report.html", ALL_VIEWS if name in SLOW else VIEWS)
 
 
 def test_study_plots_show_all_runs_and_name_infinite_values():
     study, rows = study_results()
     (plot,) = blocks(study_page(study, rows), Plot)
-    share, drift, _ = plot.panels
-    cases = [[c.index for c in study.cases if c.variation == v.name] for v in study.variations]
-    held = [np.mean([rows[k].values.get("held", False) for k in indices]) for indices in cases]
-    np.testing.assert_allclose([mark.values[0] for mark in share.marks], [100 * x for x in held], atol=1e-9)
-    assert all(isinstance(mark, Bars) and "95 % interval" in mark.texts[0] for mark in share.marks)
+    drift, _ = plot.panels
     assert sum(len(mark.x) for mark in drift.marks) == len(rows) - 1
     assert "1 of 24 are infinite" in drift.title
 

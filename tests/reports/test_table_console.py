@@ -15,7 +15,7 @@ def printed(capsys, monkeypatch, columns):
     else:
         monkeypatch.setenv("COLUMNS", str(columns))
     header = ("", "clip [N m]", "dead band [rad/s]", "standard error", "saturation [rad/s]")
-    table = Table(header, [CELLS], "Estimates", right=[False, True, True, True, True])
+    table = Table(header, [CELLS], "Estimates")
     print_page(make_console(), Page("", "answer", [Section("", [table])]))
     answer, empty, *lines = capsys.readouterr().out.splitlines()
     assert answer == "answer" and not empty

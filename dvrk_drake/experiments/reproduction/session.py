@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 import dvrk_drake as dvrk
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.model_links import model_bodies
-from dvrk_drake.experiments.ground_truth import MASS_RATIOS, collect, perturbed_arm, with_links
+from dvrk_drake.experiments.ground_truth import collect, perturbed_arm, with_links
 from dvrk_drake.experiments.releases import DURATION, Drifts, release_all
 from dvrk_drake.experiments.reproduction.published import PAPER, PaperRecordings, paper_model
 from dvrk_drake.models.arm import Arm
@@ -48,13 +48,11 @@ class IdentifiedArm:
 
     Attributes:
         arm: Simulated arm with the effects of a real arm.
-        origin: Text that states the source of its links and effects.
         poses: Static poses collected on the simulated arm.
         model: Model identified from the poses.
     """
 
     arm: Arm
-    origin: str
     poses: Recording
     model: IdentifiedModel
 
@@ -88,18 +86,13 @@ class ReproductionSession:
     def mtm(self) -> IdentifiedArm:
         """Identified MTM: the paper's arm if its recording is available, else a perturbed arm."""
         if self.recordings.folder is None:
-            return self._identify(*self._perturbed(PAPER.arm, PAPER.without))
-        origin = (
-            "The simulated arm is the paper's MTM. Its gravity, cables and springs are identified from the paper's 72 "
-            "poses. Its friction, stops, encoders, motors and delays are those of another MTM "
-            "(`mechanisms/mtm.yaml`)."
-        )
-        return self._identify(_paper_arm(self.recordings.poses, self.folder / f"true_{PAPER.arm}.sdf"), origin)
+            return self._identify(self._perturbed(PAPER.arm, PAPER.without))
+        return self._identify(_paper_arm(self.recordings.poses, self.folder / f"true_{PAPER.arm}.sdf"))
 
     @cached_property
     def psm(self) -> IdentifiedArm:
         """Identified PSM, a perturbed arm."""
-        return self._identify(*self._perturbed(PAPER.second_arm))
+        return self._identify(self._perturbed(PAPER.second_arm))
 
     @cached_property
     def paper_model(self) -> IdentifiedModel:
@@ -144,15 +137,10 @@ class ReproductionSession:
         """Returns random poses (count, n) inside the limits. Pose i depends on the seed and i, but not on the count."""
         return np.array([arm.sample_poses(1, np.random.default_rng([self.seed, i]))[0] for i in range(count)])
 
-    def _perturbed(self, name: str, without: tuple[str, ...] = ()) -> tuple[Arm, str]:
-        origin = (
-            "The simulated arm has the links of the SDF with random changes of their masses by up to "
-            f"{100 * (MASS_RATIOS[1] - 1):.0f} % (seed {self.seed}). Its effects are those of `mechanisms/`: friction, "
-            "cables, encoders, motors and delays."
-        )
-        return perturbed_arm(dvrk.load_arm(name), self.folder / f"true_{name}.sdf", self.seed, without=without), origin
+    def _perturbed(self, name: str, without: tuple[str, ...] = ()) -> Arm:
+        return perturbed_arm(dvrk.load_arm(name), self.folder / f"true_{name}.sdf", self.seed, without=without)
 
-    def _identify(self, arm: Arm, origin: str) -> IdentifiedArm:
+    def _identify(self, arm: Arm) -> IdentifiedArm:
         nominal, name = dvrk.load_arm(arm.source), arm.source
         report = step_progress(self.progress, f"collecting poses of the {arm.name}")
         poses = collect(arm, self.sample_sizes.collected, self.seed, self.executor, report)
@@ -160,7 +148,7 @@ class ReproductionSession:
         model = dvrk.identify(poses, nominal, progress=self.progress).model
         model.provenance.recording = f"{name}_poses.csv"
         model.save(self.folder / f"{name}_model.yaml")
-        return IdentifiedArm(arm, origin, poses, model)
+        return IdentifiedArm(arm, poses, model)
 
 
 def _paper_arm(recording: Recording, path: Path) -> Arm:

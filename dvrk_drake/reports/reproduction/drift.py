@@ -66,24 +66,18 @@ def reproduce_figure_5(session: ReproductionSession) -> Section:
         "ours with damping": sliding(mtm.model, many, "no friction, ours damped", mode="damped"),
     }
     staying = [_num_staying(frictionless[name]) for name in (PAPERS, OURS)]
-    whose = "has the twelve published parameters, identified with g = 9.9 m/s^2 and used with 9.81 m/s^2."
-    if session.recordings.folder is None:
-        whose = "is unweighted least squares on the same poses, because the recording of the paper is not available."
     remarks = (
-        f"{mtm.origin} **Ours** is identified from {sizes.collected} poses of this arm. Each pose is approached from "
-        f"both sides. **The paper's** {whose} The controller compensates gravity only. Each release starts at rest, "
-        "with unloaded presliding springs of the friction, at a random pose inside the joint limits, and lasts "
-        f"{sizes.duration:g} s. Without an approach, joints that the paper's model does not hold in half of the "
-        f"releases: {_lost(paper)}. There, its torque error exceeds the dry friction.",
+        "The controller compensates gravity only. Each release starts at rest, at a random pose inside the limits, and "
+        f"lasts {sizes.duration:g} s. Joints that the paper's model does not hold in half of the releases: "
+        f"{_lost(paper)}. There, its torque error exceeds the dry friction.",
         f"**After an approach**: the controller moves the arm to the pose from a distance of {APPROACH[0]:g} rad and "
         f"regulates it for {APPROACHED_RELEASE - APPROACH_TIME:g} s. This motion loads the presliding springs of the "
-        "friction, which then push joints back. An exact model causes the same drift. Failed releases by joint: "
+        "friction, which then push joints back. Failed releases by joint: "
         + "; ".join(f"{name}: {_failed(drifts[name])}" for name in list(drifts)[2:])
         + f". Hysteresis is compensated with a ratio of {MAX_HYSTERESIS_RATIO:g} and the exact friction model.",
-        "**Without friction**, a small torque error accelerates the wrist by tens of rad/s^2. Within "
-        f"{FRICTIONLESS_DURATION:g} s, no joint reaches a limit at {staying[0]} (paper's) and {staying[1]} (ours) of "
-        f"{few} poses. No gravity compensation alone passes this test. With damping (`control --mode damped`), each "
-        "drift rate is the torque error divided by the damping.",
+        f"**Without friction**, no joint reaches a limit within {FRICTIONLESS_DURATION:g} s at {staying[0]} (paper's) "
+        f"and {staying[1]} (ours) of {few} poses, because a small torque error accelerates the wrist by tens of "
+        "rad/s^2. With damping (`control --mode damped`), each drift rate is the torque error divided by the damping.",
     )
     tables = (
         _drift_table("fig5", "all torques on", drifts, PAPER.figure_5, PAPER.figure_5_means),
@@ -105,9 +99,8 @@ def reproduce_figure_6(session: ReproductionSession) -> Section:
     what = "zero torque on joints 5-7"
     table = _drift_table("fig6", what, {PAPERS: paper, OURS: ours}, PAPER.figure_6, PAPER.figure_6_means)
     remark = Text(
-        f"The experiment uses the arm and the first {few} poses of Fig. 5. Only friction resists the gravity and "
-        "spring torque of joints 5-7. The gravity torque of joints 6 and 7 is identified from the recording of 72 "
-        "poses and is about as large as their friction. Therefore these joints drift less than in the published trials."
+        f"Same arm and first {few} poses as in Fig. 5. The identified gravity torque of joints 6 and 7 is about as "
+        "large as their friction. Therefore these joints drift less than in the published trials."
     )
     plots = _plots("fig6", what, ours, paper, PAPER.figure_6, PAPER.figure_6_means)
     finding = _finding(ours, paper, "the paper's")
@@ -122,12 +115,9 @@ def reproduce_psm(session: ReproductionSession) -> Section:
     nominal = session.release(psm, nominal_model, few, "releasing the nominal model")
     drifts = {"the nominal model": nominal, OURS: ours}
     disabled = [joint.name for joint in psm.model.joints if joint.feedforward_scale == 0.0]
-    remarks = (
-        "The paper shows a model of the PSM without an experiment. The masses of this model are placeholders.",
-        f"{psm.origin} Ours is identified from {session.sample_sizes.collected} poses of this arm. Each release starts "
-        f"at a random pose inside the joint limits and lasts {session.sample_sizes.duration:g} s with gravity "
-        f"compensation only. `identify` disabled the feedforward of these joints: {', '.join(disabled) or 'none'}. "
-        "Only friction resists their gravity and spring torque.",
+    remark = Text(
+        "The paper shows a model of the PSM without an experiment. Its masses are placeholders. `identify` disabled "
+        f"the feedforward of these joints: {', '.join(disabled) or 'none'}. Only friction resists their torque."
     )
     plot = largest_drifts_plot("psm_release", "PSM", {name: (COLOURS[name], d) for name, d in drifts.items()})
     blocks: list[Block] = [
@@ -135,7 +125,7 @@ def reproduce_psm(session: ReproductionSession) -> Section:
         _mechanism_table(session.nominal(psm.arm)),
         _drift_table("psm_release", "PSM", drifts),
         plot,
-        *map(Text, remarks),
+        remark,
     ]
     return Section("Fig. 8: the PSM", blocks)
 

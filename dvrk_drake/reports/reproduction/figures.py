@@ -117,23 +117,17 @@ def reproduce_figure_4(session: ReproductionSession) -> Section:
         f"In cross-validation, our identification has a smaller torque error than the paper's on {better} of 6 joints."
     )
     worse = [JOINTS[j] for j in range(1, 7) if np.mean(paper.residuals[:, j] ** 2) > np.mean(zero[:, j] ** 2)]
-    published = session.recordings.figure_4
-    same = (
-        ""
-        if published is None
-        else (
-            "The reproduced squared errors differ from the published ones by at most "
-            f"{np.abs(paper.residuals[:, 1:] ** 2 - published).max():.0e} (N m)^2. "
-        )
-    )
+    same = ""
+    if (published := session.recordings.figure_4) is not None:
+        largest = np.abs(paper.residuals[:, 1:] ** 2 - published).max()
+        same = f"The squared errors differ from the published ones by at most {largest:.0e} (N m)^2. "
     remarks = (
-        f"Both methods use the recording of the paper ({len(recording)} poses of a real MTM). The paper's method is "
-        f"unweighted least squares with twelve parameters (eq. 10). {same}On {', '.join(worse)}, its error is larger "
-        "than that of zero torque, because the larger torques of joints 2 and 3 determine the parameters.",
-        "Our method weights each joint by its inverse residual variance, and adds offsets, springs and cables if they "
-        f"reduce the cross-validation error. {int(np.sum(~included))} measurements are excluded, because they were "
-        "made at joint stops or are outliers (crosses in the figure). With all measurements, the paper's method has a "
-        "smaller error on J2, because it fits the torque of the joint stop together with gravity.",
+        f"The paper's method is unweighted least squares with twelve parameters (eq. 10). {same}On {', '.join(worse)}, "
+        "its error is larger than that of zero torque, because the larger torques of joints 2 and 3 determine the "
+        "parameters.",
+        f"{int(np.sum(~included))} measurements at joint stops and outliers are excluded (crosses in the figure). With "
+        "all measurements, the paper's method has a smaller error on J2, because it fits the torque of the joint stop "
+        "together with gravity.",
     )
     plot = _squared_errors_plot(ours, errors, included)
     return Section("Fig. 4: torque errors", [Text(finding), squared, left_out, plot, *map(Text, remarks)])
@@ -184,18 +178,15 @@ def reproduce_figure_7(session: ReproductionSession, duration: float = DURATION)
     caption = "Largest |q| [rad] in the last 10 s (published: J2 at 59 s, J6 and J7 near the end)"
     with_fault, without = (oscillation_modes(theirs, fault)[0].real.max() for fault in (True, False))
     remarks = (
-        "The step is from J5 = 3.13, J3 = -0.79, J2 = -0.22 rad to zero. The controller of the paper runs at 100 Hz "
-        "with the published gains, on an arm with the published masses. Joints 6 and 7 start at their published "
-        "amplitudes. The controller has a fault: the damping terms of joints 5-7 use positions instead of velocities. "
-        f"With the fault, the least damped oscillation near zero (joint 7) has a decay rate of "
-        f"{max(0.0, -with_fault):.3f} /s, without it at least {-without:.3f} /s.",
-        f"Each link has an inertia of {PAPER.link_inertia:g} kg m^2, as in the PSM file of the paper. The oscillation "
-        f"period of J2 confirms this value: {PAPER.period_2:.0f} s published, {longest_period(theirs):.0f} s here.",
-        "Our controller regulates the simulated MTM of Fig. 5 with all effects except joint stops, because the start "
-        "pose is beyond the stops. It uses the identified model, the gains of `mechanisms/mtm.yaml` and a rate of "
-        f"1 kHz. The largest position error in the last second is {1e3 * _largest(ours, -1.0).max():.1f} mrad, because "
-        "friction resists small integral efforts. Solver, limits and friction of Gazebo differ, so only the decay of "
-        "the oscillations can be compared.",
+        "The step is from J5 = 3.13, J3 = -0.79, J2 = -0.22 rad to zero. Joints 6 and 7 start at their published "
+        "amplitudes. The controller of the paper has a fault: the damping terms of joints 5-7 use positions instead of "
+        f"velocities. With the fault, the least damped oscillation near zero (joint 7) has a decay rate of "
+        f"{max(0.0, -with_fault):.3f} /s, without it at least {-without:.3f} /s. The oscillation period of J2 confirms "
+        f"the assumed inertia of each link, {PAPER.link_inertia:g} kg m^2: {PAPER.period_2:.0f} s published, "
+        f"{longest_period(theirs):.0f} s here.",
+        "Our controller regulates the simulated MTM of Fig. 5 without joint stops, because the start pose is beyond "
+        f"them. The largest position error in the last second is {1e3 * _largest(ours, -1.0).max():.1f} mrad, because "
+        "friction resists small integral efforts.",
     )
     finding = (
         f"In the last 10 s, joint 7 moves up to {_largest(faulty)[6]:.3f} rad with the paper's controller as "
@@ -247,10 +238,9 @@ def reproduce_transparency(session: ReproductionSession) -> Section:
         f"{rms[3]} with friction compensation."
     )
     remark = (
-        "The paper proposes this experiment as future work. A simulated hand (spring and damper) slowly moves the "
-        f"handle of the arm of Fig. 5 along a path through random poses. {mtm.origin} In the last row, friction is "
-        f"compensated with a ratio of at most {MAX_RATIO:g}. The ratio is smaller on joints whose friction must resist "
-        "the error of the identified gravity torque (docs/friction_compensation.md)."
+        "A simulated hand (spring and damper) slowly moves the handle of the arm of Fig. 5 along a path through random "
+        f"poses. In the last row, friction is compensated with a ratio of at most {MAX_RATIO:g}. It is smaller on "
+        "joints whose friction must resist the error of the identified gravity torque (docs/friction_compensation.md)."
     )
     table = dataclasses.replace(forces_table(mtm.arm, forces), name="transparency")
     return Section(

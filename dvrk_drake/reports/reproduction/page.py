@@ -14,7 +14,6 @@ from dvrk_drake.progress import Progress
 from dvrk_drake.reports.html_file import write_html
 from dvrk_drake.reports.image_files import write_images
 from dvrk_drake.reports.page import Page, Section, Table, Text
-from dvrk_drake.reports.provenance import Provenance
 from dvrk_drake.reports.reproduction.drift import reproduce_figure_5, reproduce_figure_6, reproduce_psm
 from dvrk_drake.reports.reproduction.figures import (
     reproduce_figure_4,
@@ -83,7 +82,7 @@ def reproduce(
             session.progress = _within(progress, name)
             sections.append(_MAKERS[name](session))
             unfinished = [f"{later} was not finished." for later in wanted[len(sections) :]]
-            page = write_page(folder, sections, [*left_out, *unfinished], Provenance.of(recordings.files, command))
+            page = write_page(folder, sections, [*left_out, *unfinished], recordings.files, command)
     return page
 
 
@@ -91,14 +90,20 @@ def _within(progress: Progress, name: str) -> Progress:
     return lambda step, share: progress(f"{name}: {step}", share)
 
 
-def write_page(folder: Path, sections: Sequence[Section], left_out: Sequence[str], origin: Provenance) -> Page:
+def write_page(
+    folder: Path,
+    sections: Sequence[Section],
+    left_out: Sequence[str],
+    inputs: Sequence[Path] = (),
+    command: Sequence[str] = (),
+) -> Page:
     """Writes index.html, a CSV file for each table with a name, and a PNG file for each plot.
 
     Args:
         folder: Existing folder.
         sections: Sections of the page, in order. Each begins with the finding.
         left_out: Requested results that could not be computed, with the reason for each.
-        origin: Provenance of the page.
+        inputs, command: Provenance of the page.
     """
     findings = [(section.title, section.finding) for section in sections]
     missing = [Text(f"Missing: {reason}", "warning") for reason in left_out]
@@ -114,14 +119,14 @@ def write_page(folder: Path, sections: Sequence[Section], left_out: Sequence[str
             with atomic_write(folder / f"{table.name}.csv") as stream:
                 csv.writer(stream, lineterminator="\n").writerows([table.header, *table.rows])
     write_images(page, folder)
-    write_html(page, folder / "index.html", origin)
+    write_html(page, folder / "index.html", inputs, command)
     return page
 
 
 _PREFACE = (
     "This page compares published figures and tables of Gravity Compensation Control of da Vinci Robot (Rutfield, "
     "Zia, Boos, Santoso, Sujumnong, WPI 2015) with results of `dvrk-drake reproduce`. Each table is also a CSV file. "
-    "Angles are in rad, torques in N m. "
+    "Angles are in rad, torques in N m. docs/public_recordings.md describes the simulated arms. "
     '"The paper\'s" denotes the method or parameters of the paper, "ours" denotes the method or model of this project.'
 )
 _NEXT_DATA = (

@@ -43,6 +43,7 @@
   const views = [...document.querySelectorAll("figure.meshcat")].map((figure) => ({
     figure,
     start: Number(figure.dataset.start),
+    poses: Number(figure.dataset.poses),
     frame: figure.querySelector("iframe"),
     player: figure.querySelector(".player"),
     button: figure.querySelector(".play"),
@@ -135,7 +136,7 @@
     timePlots.forEach(placeCursors);
     for (const v of views) if (v.animator) {
       v.slider.value = time - v.start;
-      v.output.textContent = time.toFixed(2) + " s";
+      v.output.textContent = v.poses ? `pose ${Math.round(time)} of ${v.poses}` : `${time.toFixed(2)} s`;
       v.button.textContent = v.animator.playing ? "Pause" : "Play";
     }
   }
