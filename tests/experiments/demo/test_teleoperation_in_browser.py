@@ -34,7 +34,7 @@ _CORNERS = """() => {
 
 @pytest.fixture
 def teleop():
-    """Process of the command `teleop`, and the address of its page."""
+    """Process of the command `simulate teleop`, and the address of its page."""
     command = [sys.executable, "-m", "dvrk_drake.cli", "simulate", "teleop"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
