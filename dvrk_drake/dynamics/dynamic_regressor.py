@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform
 
@@ -198,8 +197,10 @@ def derive_base_parameters(model: DynamicRegressor) -> DynamicBaseParameters:
     the torque. The last columns of the regressor, for terms that couple two rotors, are excluded, because real motors
     have no such terms (see `rotor_inertias`).
     """
+    from scipy.linalg import block_diag
+
     frames = _link_frames(model)
-    to_links = scipy.linalg.block_diag(*(change_of_frame(X_LF) for _, X_LF in frames), np.eye(model.arm.num_joints))
+    to_links = block_diag(*(change_of_frame(X_LF) for _, X_LF in frames), np.eye(model.arm.num_joints))
     p = len(to_links)
     parameters = [StandardParameter(label, axis) for label, _ in frames for axis in _AXES]
     for i, prismatic in enumerate(model.arm.prismatic, start=1):

@@ -221,7 +221,7 @@ def test_identification_recording_gives_no_verdict_to_rely_on(files, tmp_path, c
 def test_run_warns_of_saved_verdicts(files, capsys):
     model, good, bad = files
     loaded = IdentifiedModel.load(model)
-    assert "not validated on another recording; verdict by cross-validation: " in model_warning(model, loaded)
+    assert "not validated on another recording; run: " in model_warning(model, loaded)
     assert main(["validate", bad, "--model", model, "--save"]) == 0
     saved = IdentifiedModel.load(model)
     assert dataclasses.replace(saved, validation=None) == loaded

@@ -97,8 +97,7 @@ LOOK = r"Look at the arm, then start again, over LCM with --reset"
 @pytest.mark.parametrize("seconds", [0.02, 0.05, 0.2, 1.0])
 def test_stopped_controller_ends_and_operator_resumes(controller, seconds):
     link, output = GuardedArm(), []
-    # The measured efforts of this arm do not follow the commands, which the guard finds after about two seconds.
-    end = link.now() + (1.0 if seconds < 0.05 else 2.0)
+    end = link.now() + 2.0
     link.before_step = after(500, lambda: pause_controller(link, seconds))
     if seconds < 0.05:
         control(link, controller, lambda: link.now() > end, lambda status: None)

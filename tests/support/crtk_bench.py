@@ -90,7 +90,7 @@ class CrtkBench:
         n = self.client.arm.num_joints
         self.q, self.v, self.effort, self.stamp_offset = np.array(POSES[name]), np.zeros(n), np.zeros(n), 0
         self.problem, self.raw, self.sequence = "", [], 0
-        guard = GuardSettings(plausibility=PlausibilitySettings(start_gravity=2.0))
+        guard = GuardSettings(plausibility=PlausibilitySettings(start_gravity=2.0, tracking_error=1.0, zero_time=1.0))
         driver = DvrkDriver(guard=guard, control_modes=list(modes), key_file=str(key_file))
         self.bridge = CrtkBridge(
             self.client,

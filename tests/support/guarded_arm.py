@@ -4,15 +4,21 @@ from guard_bench import ARM, LIMIT, SESSION, N, Q, Weightless
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.systems.guard.command_guard import CommandGuard
+from dvrk_drake.systems.guard.settings import GuardSettings, PlausibilitySettings
 from dvrk_drake.systems.lcm.messages import fill_in_guard
 
 
 class GuardedArm:
-    """Link to an arm that does not move, and to its guard. A status arrives every simulated millisecond."""
+    """Link to an arm that does not move, and to its guard. A status arrives every simulated millisecond.
+
+    The measured effort is constant, so the guard does not compare it with the commands.
+    """
 
     def __init__(self, modes=None):
         self.arm, self.lost, self.utime = ARM, 0, 10**9
-        self.guard, self.commands, self.status = CommandGuard(ARM, SESSION, Weightless(), modes=modes), [], Status()
+        settings = GuardSettings(plausibility=PlausibilitySettings(tracking_error=1.0))
+        self.guard = CommandGuard(ARM, SESSION, Weightless(), settings, modes=modes)
+        self.commands, self.status = [], Status()
         self.before_step = lambda: None
         self.status.arm_name, self.status.num_joints = ARM.name, N
         self.status.position, self.status.velocity = list(Q), [0.0] * N

@@ -213,7 +213,7 @@ def test_mistakes_in_the_directives_are_reported(path, directives, parent, messa
         ({"guard": {"expiry": 9.0}}, r"\.ros_driver\.guard\.expiry is 9; allowed: "),
         ({"control_modes": ["jump"]}, r": control_modes contains an unknown mode: \['jump'\]; allowed: position, "),
         ({"namespace": "MTM L"}, ': namespace is "MTM L"; allowed: '),
-        ([1], r"\.ros_driver is \[1\]; allowed: a mapping with the keys domain, "),
+        ([1], r"\.ros_driver is \[1\]; allowed: a mapping with the keys control_modes, "),
     ],
 )
 def test_mistakes_in_the_driver_over_ros_are_reported(path, section, message):

@@ -163,7 +163,7 @@ def test_driver_file(tmp_path):
     path = tmp_path / "driver.yaml"
     path.write_text("domain: 3\nnamespace: dvrk/MTML\nrate: 500\ngravity_compensation: true\n")
     driver = load_typed_yaml(CrtkDriver, path, StationError, "a driver's configuration")
-    assert driver == CrtkDriver(3, "dvrk/MTML", 500.0, gravity_compensation=True)
+    assert driver == CrtkDriver(domain=3, namespace="dvrk/MTML", rate=500.0, gravity_compensation=True)
     names = [CrtkDriver(namespace=text).arm_namespace(load_arm("psm")) for text in ("", "/PSM2", "dvrk/PSM2/")]
     assert names == ["/PSM1", "/PSM2", "/dvrk/PSM2"]
     assert CrtkDriver().arm_namespace(load_arm("mtmr")) == "/MTMR"
