@@ -23,6 +23,7 @@ from dvrk_drake.processes.connection import connect
 from dvrk_drake.processes.control import control, first_status
 from dvrk_drake.processes.live_status import LiveStatus, LiveStatusMaker
 from dvrk_drake.processes.teacher import Teacher
+from dvrk_drake.systems.guard.settings import GuardSettings
 from dvrk_drake.systems.lcm.arm_link import LcmArmLink
 
 
@@ -178,8 +179,8 @@ def test_fault_during_release_ends_immediately(controller):
 
 
 def test_control_applies_efforts_reports_and_releases(controller):
-    link, reports = GuardedArm(), []
-    end = link.now() + 1.5
+    link, reports = GuardedArm(settings=GuardSettings()), []
+    end = link.now() + 1.0
     control(link, controller, lambda: link.now() > end, reports.append)
     assert {status.state for status in reports} >= {"starting", "effort"}
     assert "round trip" in str(reports[-1]) and not reports[-1].problem

@@ -7,16 +7,17 @@ from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.guard.settings import GuardSettings, PlausibilitySettings
 from dvrk_drake.systems.lcm.messages import fill_in_guard
 
+INDULGENT = GuardSettings(plausibility=PlausibilitySettings(tracking_error=1.0))
+
 
 class GuardedArm:
     """Link to an arm that does not move, and to its guard. A status arrives every simulated millisecond.
 
-    The measured effort is constant, so the guard does not compare it with the commands.
+    The measured effort is constant, so by default the guard does not compare it with the commands.
     """
 
-    def __init__(self, modes=None):
+    def __init__(self, modes=None, settings=INDULGENT):
         self.arm, self.lost, self.utime = ARM, 0, 10**9
-        settings = GuardSettings(plausibility=PlausibilitySettings(tracking_error=1.0))
         self.guard = CommandGuard(ARM, SESSION, Weightless(), settings, modes=modes)
         self.commands, self.status = [], Status()
         self.before_step = lambda: None
