@@ -23,7 +23,6 @@ from dvrk_drake.processes.connection import connect
 from dvrk_drake.processes.control import control, first_status
 from dvrk_drake.processes.live_status import LiveStatus, LiveStatusMaker
 from dvrk_drake.processes.teacher import Teacher
-from dvrk_drake.systems.guard.settings import GuardSettings
 from dvrk_drake.systems.lcm.arm_link import LcmArmLink
 
 
@@ -179,11 +178,12 @@ def test_fault_during_release_ends_immediately(controller):
 
 
 def test_control_applies_efforts_reports_and_releases(controller):
-    link, reports = GuardedArm(settings=GuardSettings()), []
-    end = link.now() + 1.0
+    link, reports = GuardedArm(), []
+    end = link.now() + 1.5
     control(link, controller, lambda: link.now() > end, reports.append)
     assert {status.state for status in reports} >= {"starting", "effort"}
-    assert "round trip" in str(reports[-1]) and not reports[-1].problem
+    assert "round trip" in str(reports[-1])
+    assert reports[-1].problem == "guard settings weaker than the defaults: tracking_error is 1 (default: 0.1)"
     assert link.guard.state == Status.STATE_HOLD and link.commands[-1].control_mode == Command.HOLD
 
 

@@ -13,12 +13,12 @@ INDULGENT = GuardSettings(plausibility=PlausibilitySettings(tracking_error=1.0))
 class GuardedArm:
     """Link to an arm that does not move, and to its guard. A status arrives every simulated millisecond.
 
-    The measured effort is constant, so by default the guard does not compare it with the commands.
+    The measured effort is constant, so the guard does not compare it with the commands.
     """
 
-    def __init__(self, modes=None, settings=INDULGENT):
+    def __init__(self, modes=None):
         self.arm, self.lost, self.utime = ARM, 0, 10**9
-        self.guard = CommandGuard(ARM, SESSION, Weightless(), settings, modes=modes)
+        self.guard = CommandGuard(ARM, SESSION, Weightless(), INDULGENT, modes=modes)
         self.commands, self.status = [], Status()
         self.before_step = lambda: None
         self.status.arm_name, self.status.num_joints = ARM.name, N
