@@ -8,7 +8,7 @@ from robot_motion import random_motion
 
 import dvrk_drake as dvrk
 from dvrk_drake.analysis.estimation.point_mass import point_mass_parameters
-from dvrk_drake.cli import main
+from dvrk_drake.cli import main, support
 from dvrk_drake.dynamics.inertial_parameters import LinkInertia, link_inertias
 
 STUDY = {
@@ -58,7 +58,11 @@ def test_commands_accept_a_model_file(tmp_path, monkeypatch, capsys):
         "simulate tune --arm random.urdf --method model --output gains.yaml",
         "export --model model.yaml --sdf identified.sdf",
         "export --model model.yaml --urdf identified.urdf",
+        "export --model model.yaml --mjcf identified.xml",
+        "view --arm random.urdf",
     ]
+    # The page shows the arm once, instead of until the operator stops it.
+    monkeypatch.setattr(support, "until_stopped", lambda meshcat, update: update())
     for command in commands:
         assert main(command.split()) == 0, (command, capsys.readouterr())
     # What was exported is again a model file.
