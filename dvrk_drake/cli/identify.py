@@ -10,7 +10,7 @@ from cyclopts import Parameter, Token
 import dvrk_drake as dvrk
 from dvrk_drake.cli import options, support
 from dvrk_drake.cli.report import Results, ResultsAndJson
-from dvrk_drake.errors import ModelError
+from dvrk_drake.errors import ModelError, RecordingError
 
 if TYPE_CHECKING:
     from dvrk_drake.analysis.results import Identification, Validation
@@ -131,7 +131,11 @@ def _model_and_recording(
 ) -> tuple[dvrk.IdentifiedModel, dvrk.Recording]:
     """Loads a model and a recording of its arm, and prints the notes on the recording."""
     loaded = support.load_model(model, None)
-    read = file.read(recording, loaded.arm, steps)
+    try:
+        read = file.read(recording, loaded.arm, steps)
+    except RecordingError as error:
+        # A recording of another arm lacks columns or exceeds limits, and its own message cannot name the cause.
+        raise RecordingError(f"{error}. {model} is a model of {loaded.arm.name}") from error
     support.print_notes(recording, read.notes)
     return loaded, read
 

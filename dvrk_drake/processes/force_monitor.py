@@ -52,7 +52,7 @@ class ForceMonitor:
         self._observer, self._contact, self._send = MomentumObserver(model), Contact(arm, axes="frame"), send
         self._threshold = np.inf if stop_on_contact is None else self._observer.threshold(stop_on_contact)
         self._state, self._utime, self._next_send = self._observer.start(), 0, 0
-        self._observer.covariance(self._state)
+        self._observer.covariance(self._state)  # raises an error if the model does not state its errors
         self._message = lcmt_dvrk_force()
         self._message.arm_name, self._message.frame_name = arm.name, arm.frames.hand
 

@@ -78,7 +78,7 @@ def _verdict(report: RecordingReport, source: str, is_model: bool, other_arm: st
     if report.refusals:
         verdict, level, found = "unusable", "bad", report.refusals
         again = f"--arm {other_arm}" if other_arm else source
-        command = f"dvrk-drake check {report.source if other_arm else 'OTHER.csv'} {again}"
+        command = f"dvrk-drake check {report.source} {again}"
     elif report.warnings:
         verdict, level = f"usable with {_count(len(report.warnings), 'warning')}", "warning"
     kinds = ", ".join(dict.fromkeys(finding.kind for finding in found))

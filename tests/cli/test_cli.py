@@ -311,6 +311,12 @@ def test_validate_writes_null_for_a_joint_without_effort(folder, tmp_path):
     assert json.loads((tmp_path / "v.json").read_text())["joints"][6]["relative_error"] is None
 
 
+def test_model_of_another_arm_is_named(folder, tmp_path, capsys):
+    (tmp_path / "two_joints.csv").write_text("q1,q2,tau1,tau2\n0,0,0,0\n")
+    message = fails(capsys, "validate", tmp_path / "two_joints.csv", "--model", folder / "model.yaml")
+    assert "missing columns q3" in message and f"{folder}/model.yaml is a model of MTM" in message
+
+
 INTERRUPTED_IMPORT = """
 import os, signal, sys
 

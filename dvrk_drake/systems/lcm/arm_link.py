@@ -62,8 +62,12 @@ class ArmLink(ABC):
         """Sends a command."""
 
     def send_force(self, force: lcmt_dvrk_force) -> None:
-        """Publishes an estimated external force for other programs. The arm does not use it."""
-        raise NotImplementedError
+        """Publishes an estimated external force for other programs. The arm does not use it.
+
+        Raises:
+            ControllerError: This link does not publish forces.
+        """
+        raise ControllerError(f"{self.arm.name}: the force is published only while a controller acts")
 
     def now(self) -> float:
         """Returns the time of the computer's monotonic clock [s]."""
@@ -101,7 +105,7 @@ class MessageLink(ArmLink):
                 a controller, because old statuses would determine the commands.
         """
         super().__init__(arm)
-        self._replays, self._key = replays, key
+        self._replays, self._key, self._command_channel = replays, key, command_channel(arm)
         session = 0 if before is None else before.session_id
         self._filter = StatusFilter(arm.name, arm.num_joints, key, session_id=session)
         self._last: lcmt_dvrk_status | None = None
@@ -112,8 +116,8 @@ class MessageLink(ArmLink):
         """Handles one message that arrives within `seconds`. Returns whether one arrived."""
 
     @abstractmethod
-    def _publish(self, data: bytes) -> None:
-        """Sends an encoded command."""
+    def _publish(self, channel: str, data: bytes) -> None:
+        """Sends an encoded message."""
 
     def poll(self) -> lcmt_dvrk_status | None:
         """Returns the newest status that arrived since the last call, or None."""
@@ -141,7 +145,11 @@ class MessageLink(ArmLink):
 
     def send(self, command: lcmt_dvrk_command) -> None:
         """Sends a command."""
-        self._publish(self._signed(command))
+        self._publish(self._command_channel, self._signed(command))
+
+    def send_force(self, force: lcmt_dvrk_force) -> None:
+        """Sends an estimated external force on the channel DVRK_FORCE_<ARM>."""
+        self._publish(force_channel(self.arm), self._signed(force))
 
     def _signed(self, message: lcmt_dvrk_command | lcmt_dvrk_force) -> bytes:
         data = message.encode()
@@ -184,14 +192,10 @@ class LcmArmLink(MessageLink):
     ) -> None:
         """Opens the channels of `arm` on the LCM network `url`; see `MessageLink` for the other arguments."""
         super().__init__(arm, key=key, before=before, replays=replays)
-        self.where, self._channel = status_channel(arm), command_channel(arm)
+        self.where = status_channel(arm)
         self._lcm = lcm.LCM(url)
         self._subscription = self._lcm.subscribe(self.where, lambda channel, data: self._receive(data))
         self._subscription.set_queue_capacity(_QUEUE)
-
-    def send_force(self, force: lcmt_dvrk_force) -> None:
-        """Sends an estimated external force on the channel DVRK_FORCE_<ARM>."""
-        self._lcm.publish(force_channel(self.arm), self._signed(force))
 
     def close(self) -> None:
         """Stops receiving and ends LCM's receive thread, which otherwise wakes up for every message."""
@@ -202,8 +206,8 @@ class LcmArmLink(MessageLink):
     def _handle(self, seconds: float) -> bool:
         return handle_message(self._lcm, seconds)
 
-    def _publish(self, data: bytes) -> None:
-        self._lcm.publish(self._channel, data)
+    def _publish(self, channel: str, data: bytes) -> None:
+        self._lcm.publish(channel, data)
 
 
 class DrakeLcmArmLink(MessageLink):
@@ -215,7 +219,7 @@ class DrakeLcmArmLink(MessageLink):
     def __init__(self, arm: Arm, network: DrakeLcmInterface, *, key: MessageKey | None = None) -> None:
         """Subscribes to the statuses of `arm`. See `MessageLink` for `key`."""
         super().__init__(arm, key=key)
-        self.where, self._channel, self._network = status_channel(arm), command_channel(arm), network
+        self.where, self._network = status_channel(arm), network
         network.Subscribe(self.where, self._receive)
 
     def close(self) -> None:
@@ -228,5 +232,5 @@ class DrakeLcmArmLink(MessageLink):
     def _handle(self, seconds: float) -> bool:
         return False
 
-    def _publish(self, data: bytes) -> None:
-        self._network.Publish(self._channel, data)
+    def _publish(self, channel: str, data: bytes) -> None:
+        self._network.Publish(channel, data)

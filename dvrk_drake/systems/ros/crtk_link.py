@@ -108,6 +108,6 @@ class CrtkArmLink(MessageLink):
         # The bridge has handled all messages.
         return False
 
-    def _publish(self, data: bytes) -> None:
+    def _publish(self, channel: str, data: bytes) -> None:
         self._bridge.put(data)
         self._bridge.update()
