@@ -122,7 +122,7 @@ def test_numbers_out_of_range_are_refused():
 @pytest.mark.slow
 @pytest.mark.parametrize(("factor", "delay"), [(1.0, 0.0), (1.0, 0.05), (1.2, 0.05)])
 def test_contact_with_a_stiff_wall_is_passive_and_stable(factor, delay):
-    """A hand pushes the tip 10 mm into a wall of 2000 N/m (at a scale of 0.4), and withdraws."""
+    """A hand moves the goal of the tip 10 mm into a wall of 2000 N/m (at a scale of 0.4), and withdraws."""
     model = exact_model(FOLLOWER)
     links = [replace(link, parameters=[factor * p for p in link.parameters]) for link in model.dynamics.links]
     model = replace(model, dynamics=replace(model.dynamics, links=links))
