@@ -68,9 +68,11 @@ class Response(Check):
         self._lasting = self._lasting + min(sample.dt / self._memory, 1.0) * unexplained
         size, driving_size, inertial_size = np.abs(unexplained), np.abs(driving), np.abs(inertial)
         opposed = 0.5 * size - 1.5 * np.abs(driving + inertial)
-        grows = (driving_size > self._driving_size) & (inertial_size > self._inertial_size)
-        opposed = opposed * (grows & (self._effort * inertial < 0.0))
-        self._opposed = np.maximum(self._opposed + gain * (opposed - self._opposed), 0.0)
+        self._opposed = (1.0 - gain) * self._opposed
+        if is_any(opposed > 0.0):
+            grows = (driving_size > self._driving_size) & (inertial_size > self._inertial_size)
+            counts = grows & (self._effort * inertial < 0.0) & (opposed > 0.0)
+            self._opposed = self._opposed + gain * counts * opposed
         self._driving_size = self._driving_size + gain * (driving_size - self._driving_size)
         self._inertial_size = self._inertial_size + gain * (inertial_size - self._inertial_size)
         # Negated comparison, so that NaN counts as implausible.
