@@ -105,7 +105,8 @@ def test_documentation_contains_all_commands():
 def test_files_and_commands_for_a_new_arm_work(tmp_path, monkeypatch):
     """The files in docs/your_robot.md, whose first lines are their names, describe arms that the commands accept."""
     monkeypatch.chdir(tmp_path)
-    write_robot(tmp_path, name="my_robot.urdf")
+    for name in ("my_robot.urdf", "identified.urdf"):  # `export`, which needs a recording, writes the second file
+        write_robot(tmp_path, name=name)
     page = (ROOT / "docs/your_robot.md").read_text()
     for block in re.findall(r"```(?:yaml|xml)\n(.*?)```", page, re.DOTALL):
         name = re.match(r"(?:#|<!--) (\S+)", block)

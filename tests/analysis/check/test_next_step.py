@@ -42,5 +42,6 @@ def test_next_step_names_no_arm_if_several_fit(tmp_path, capsys):
     assert check(capsys, tmp_path, 0.0, "psm")[0] == "r.csv --arm ARM"
 
 
-def test_a_recording_of_no_arm_is_replaced(tmp_path, capsys):
-    assert check(capsys, tmp_path, 6.0, "mtmr")[0] == "OTHER.csv --arm mtmr"
+def test_a_recording_of_no_arm_is_checked_again(tmp_path, capsys):
+    """The cause is in the file, which the user corrects."""
+    assert check(capsys, tmp_path, 6.0, "mtmr")[0] == "r.csv --arm mtmr"
