@@ -48,7 +48,7 @@ def test_all_scripts_are_tested():
         "03_identify.py",
         "04_validate_on_another_day.py",
         "07_force_at_the_tip.py",  # the docstring example of `estimate_force` has the same steps
-        "09_hardware_station.py",  # tests/udp/test_connect_udp.py
+        "09_hardware_station.py",  # tests/udp/test_crtk_station_udp.py
     }
 
 

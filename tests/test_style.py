@@ -1,7 +1,9 @@
 """Automatic style checks: banned words, docstrings, test names, length of the README."""
 
+import ast
 import re
 import subprocess
+from pathlib import Path
 
 from repository import ROOT
 
@@ -62,3 +64,80 @@ def test_test_names_are_short():
 
 def test_readme_is_short():
     assert len((ROOT / "README.md").read_text().splitlines()) <= MAX_README_LINES
+
+
+# Tests compare computed numbers with a tolerance, because rounding in BLAS and numba depends on the CPU.
+
+
+TESTS = Path(__file__).parent
+#: Smallest absolute tolerance, 450 times the rounding error of numbers near 1.
+MIN_VALUE = 1e-13
+#: Functions that compute with BLAS or numba. Tests must not compare their results exactly.
+COMPUTED = {"column", "effect_effort", "effort", "holding_torque", "mass_matrix", "predict", "predict_motion"} | {
+    *("pull_back_effort", "regressor", "torque"),
+}
+
+
+def calls(*names):
+    """Yields the location and the syntax node of each call of the named functions in the tests."""
+    for path in sorted(TESTS.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and called(node) in names:
+                yield f"{path.relative_to(TESTS)}:{node.lineno}", node
+
+
+def called(node):
+    return node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+
+
+def argument(node, name):
+    return next((keyword.value for keyword in node.keywords if keyword.arg == name), None)
+
+
+def test_comparisons_have_an_absolute_tolerance():
+    """A relative tolerance alone fails for numbers that can be zero. `atol=0` declares that they cannot be zero."""
+    found = dict(calls("assert_allclose", "isclose", "allclose"))
+    assert len(found) > 100
+    assert not [place for place, node in found.items() if argument(node, "atol") is None]
+
+
+def test_tolerances_exceed_rounding_errors():
+    found = [(p, argument(n, "atol")) for p, n in calls("assert_allclose", "isclose", "allclose")]
+    found += [(p, argument(n, "abs")) for p, n in calls("approx")]
+    assert not [p for p, atol in found if isinstance(atol, ast.Constant) and 0 < atol.value < MIN_VALUE]
+
+
+def test_computed_numbers_are_not_compared_exactly():
+    found = list(calls("assert_array_equal", "array_equal"))
+    assert found
+    assert not [p for p, node in found if {called(n) for n in ast.walk(node) if isinstance(n, ast.Call)} & COMPUTED]
+
+
+# Public methods of Systems have Drake-style names (`SetGains`), other classes Python-style names (`load_arm`).
+
+
+SYSTEMS = {"LeafSystem", "Diagram"}
+#: Methods that override those of Drake.
+OF_DRAKE = {"Serialize", "Deserialize"}
+
+
+def public_methods():
+    """Returns (location, flag of a System, name) of each public method that is not a property."""
+    for path in sorted((ROOT / "dvrk_drake").rglob("*.py")):
+        if "lcmtypes" in path.parts:
+            continue
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ClassDef):
+                is_system = any(isinstance(base, ast.Name) and base.id in SYSTEMS for base in node.bases)
+                for method in node.body:
+                    if isinstance(method, ast.FunctionDef) and not method.name.startswith("_"):
+                        names = {d.id for d in method.decorator_list if isinstance(d, ast.Name)}
+                        if not names & {"property", "cached_property"}:
+                            yield f"{path.name}: {node.name}.{method.name}", is_system, method.name
+
+
+def test_method_names_follow_the_style():
+    methods = list(public_methods())
+    assert sum(is_system for _, is_system, _ in methods) > 10
+    wrong = [where for where, is_system, name in methods if name[0].isupper() != is_system and name not in OF_DRAKE]
+    assert not wrong, wrong

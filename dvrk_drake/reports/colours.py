@@ -1,6 +1,6 @@
 """Colours of figures and pages: one colour per role, and a palette for series without a role.
 
-People with deuteranopia (missing green receptors) can distinguish the colours: `tests/reports/test_colours.py`
+People with deuteranopia (missing green receptors) can distinguish the colours: `tests/reports/test_image_files.py`
 simulates their vision. The lightness also differs, for prints without colour. This module imports no plotting library.
 """
 

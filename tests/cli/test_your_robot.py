@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 import yaml
-from robot_file import random_robot
-from robot_motion import random_motion
+from robot_file import random_motion, random_robot
 
 import dvrk_drake as dvrk
 from dvrk_drake.analysis.estimation.point_mass import point_mass_parameters

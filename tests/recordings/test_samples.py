@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import re
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from repository import ROOT
 
 import dvrk_drake as dvrk
 from dvrk_drake.cli import main
+from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.samples import SAMPLES, SAMPLES_FOLDER
 
 FILES = {f"{name}{suffix}" for name in SAMPLES for suffix in (".csv", ".mcap")}
@@ -125,3 +127,29 @@ def test_failed_write_leaves_no_files(tmp_path, monkeypatch):
     with pytest.raises(dvrk.DvrkDrakeError, match="No space left on device"):
         dvrk.write_samples(tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+# Tests the Python code in docs/public_recordings.md.
+
+
+DOCUMENT = ROOT / "docs" / "public_recordings.md"
+
+
+def document_functions() -> dict[str, object]:
+    namespace: dict[str, object] = {}
+    for block in re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(encoding="utf-8"), re.DOTALL):
+        exec(block, namespace)
+    return namespace
+
+
+@pytest.mark.parametrize("average", [False, True])
+def test_documented_code_for_2017_pairs(tmp_path, average):
+    position, effort = np.random.default_rng(5).normal(size=(2, 8, 10, 4))
+    effort[:, :, 3] = 0
+    document_functions()["write_2017"](position, effort, tmp_path / "poses.csv", average)
+    recording = read_recording(tmp_path / "poses.csv")
+    assert len(recording) == (3 if average else 30)
+    if average:
+        np.testing.assert_allclose(recording.q[2], position[:7, :, 2].mean(axis=1), atol=1e-12)
+    else:
+        np.testing.assert_array_equal(recording.tau[13], effort[:7, 3, 1])

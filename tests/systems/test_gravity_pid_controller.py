@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from controlled_arm import ControlledArm
 from pydrake.systems.analysis import Simulator
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -11,9 +12,10 @@ from dvrk_drake.errors import ControllerError, ModelError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.arm_schema import Gains
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions
+from dvrk_drake.systems.effort_ramp import EffortRamp
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
-pytestmark = [pytest.mark.numeric, pytest.mark.drake_api]
+pytestmark = [pytest.mark.drake_api, pytest.mark.numeric]
 
 ARM = load_arm("mtml")
 MODEL = IdentifiedModel.from_arm(ARM)
@@ -236,3 +238,67 @@ def test_unconnected_state_is_reported():
     controller = GravityPidController(MODEL)
     with pytest.raises(ControllerError, match="input port state_estimated is not connected"):
         Simulator(controller).Initialize()
+
+
+# Ramp from the measured to the desired effort.
+
+
+def test_ramp_starts_when_enabled_and_restarts():
+    ramp = EffortRamp(2, duration=0.1)
+    simulator = Simulator(ramp)
+    context = simulator.get_mutable_context()
+    measured, wanted = np.array([1.0, -1.0]), np.array([3.0, 5.0])
+    ramp.GetInputPort("effort_measured").FixValue(context, measured)
+    ramp.GetInputPort("effort_wanted").FixValue(context, wanted)
+    enabled = ramp.GetInputPort("enabled")
+    enabled.FixValue(context, [0.0])
+    output = ramp.get_output_port()
+    simulator.AdvanceTo(0.0505)
+    np.testing.assert_array_equal(output.Eval(context), measured)
+    enabled.FixValue(context, [1.0])
+    simulator.AdvanceTo(0.1005)
+    np.testing.assert_allclose(output.Eval(context), measured + 0.5 * (wanted - measured), atol=1e-9)
+    # Later measurements have no effect.
+    ramp.GetInputPort("effort_measured").FixValue(context, [7.0, 7.0])
+    simulator.AdvanceTo(0.3005)
+    np.testing.assert_allclose(output.Eval(context), wanted, atol=1e-9)
+    enabled.FixValue(context, [0.0])
+    simulator.AdvanceTo(0.3025)
+    np.testing.assert_array_equal(output.Eval(context), [7.0, 7.0])
+
+
+def test_a_forced_update_is_one_period():
+    ramp = EffortRamp(1, period=0.01, duration=0.1)
+    context = ramp.CreateDefaultContext()
+    for name, value in {"effort_measured": [0.0], "effort_wanted": [1.0], "enabled": [1.0]}.items():
+        ramp.GetInputPort(name).FixValue(context, value)
+    for k in range(1, 15):
+        state = ramp.AllocateDiscreteVariables()
+        ramp.CalcForcedDiscreteVariableUpdate(context, state)
+        context.SetDiscreteState(state)
+        assert ramp.get_output_port().Eval(context)[0] == pytest.approx(min(1.0, 0.1 * k))
+
+
+def test_invalid_ramp_is_refused():
+    with pytest.raises(ControllerError, match="must be positive"):
+        EffortRamp(7, duration=0.0)
+
+
+# Arms in other mountings: gravity has another direction in the base frame.
+
+
+@pytest.mark.parametrize(
+    ("name", "gravity"), [("mtml", (3.0, 2.0, -9.1)), ("mtml", (0.0, 0.0, 9.81)), ("psm", (0.0, -9.81, 0.0))]
+)
+def test_only_model_of_same_mounting_holds_the_arm(name, gravity):
+    arm = load_arm(name)
+    mounted = arm.with_gravity(gravity)
+    q = (arm.position_lower + 2 * arm.position_upper) / 3
+    q[2] -= 0.4 if name == "mtml" else 0.0  # inside the parallelogram's stops
+    assert not arm.limit_violations(q)
+    right, wrong = (
+        ControlledArm(arm, q, IdentifiedModel.from_arm(modelled), plant_arm=mounted, closure="ball").drift(0.5).max()
+        for modelled in (mounted, arm)
+    )
+    assert right < 1e-5
+    assert wrong > 0.05

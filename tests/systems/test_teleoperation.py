@@ -2,16 +2,80 @@
 
 import numpy as np
 import pytest
-from pydrake.math import RollPitchYaw, RotationMatrix
+from pydrake.common.value import AbstractValue
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.analysis import Simulator
+from pydrake.trajectories import PiecewisePose
 from robot_file import write_robot
-from teleoperation_loop import MTM, PERIOD, PSM, Q_F, Q_M, SPEED, Loop, angle, handle, tip
 
 from dvrk_drake.errors import ControllerError
+from dvrk_drake.experiments.demo.teleoperation import SCALE, START_FOLLOWER, START_MASTER
 from dvrk_drake.models.arm_files import load_arm
+from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
+from dvrk_drake.systems.hand import PoseTrajectorySource
+from dvrk_drake.systems.teleoperated_arms import TeleoperatedArms
 from dvrk_drake.systems.teleoperation import MAX_LAG, MIN_DEPTH, Teleoperation
 
-pytestmark = pytest.mark.numeric
+pytestmark = [pytest.mark.drake_api, pytest.mark.numeric]
+
+MTM, PSM = load_arm("mtml"), load_arm("psm")
+#: Maximum speeds of yaw, pitch, insertion, roll, wrist pitch, wrist yaw, jaw [rad/s, m/s] (Wang et al. 2019).
+SPEED = np.array([1.7, 1.7, 0.35, 2.0, 2.0, 3.0, 3.0])
+PERIOD = 1e-3
+Q_M = np.array([0.1, 0.3, -0.1, 0.2, 1.0, 0.1, 0.3])
+Q_F = np.array([0.2, -0.1, 0.13, 0.4, 0.2, -0.3, 0.5])
+
+
+def pose(arm, frame, q):
+    plant = make_arm_plant(arm)
+    context = plant.CreateDefaultContext()
+    set_arm_positions(plant, context, arm, q)
+    return plant.GetFrameByName(frame).CalcPoseInWorld(context)
+
+
+def handle(q):
+    return pose(MTM, "dh_7", q)
+
+
+def tip(q):
+    return pose(PSM, "dh_6", q)
+
+
+def angle(R):
+    return abs(R.ToAngleAxis().angle())
+
+
+class Loop:
+    """`Teleoperation` with a follower that reaches each command immediately, unless specified otherwise."""
+
+    def __init__(self, q_follower=Q_F, q_master=Q_M, arms=(MTM, PSM), **arguments):
+        self.system, self.num_joints = Teleoperation(*arms, **arguments), arms[1].num_joints
+        self.context = self.system.CreateDefaultContext()
+        self.inputs = {"master_position": q_master, "follower_position": q_follower, "engaged": 0.0, "jaw_angle": 0.5}
+        self.step()
+
+    def step(self, follower=None, **inputs):
+        """Runs one update; returns the desired positions (n,) and velocities (n,)."""
+        self.inputs.update(inputs)
+        if follower is not None:
+            self.inputs["follower_position"] = follower
+        for name, value in self.inputs.items():
+            self.system.GetInputPort(name).FixValue(self.context, np.atleast_1d(value))
+        state = self.context.get_mutable_discrete_state()
+        state.SetFrom(self.system.EvalUniquePeriodicDiscreteUpdate(self.context))
+        desired = self.system.GetOutputPort("desired_state").Eval(self.context)
+        if follower is None and np.all(np.isfinite(desired)):
+            self.inputs["follower_position"] = desired[: self.num_joints].copy()
+        return desired[: self.num_joints].copy(), desired[self.num_joints :].copy()
+
+    def move(self, q_master, steps=400):
+        """Moves the master to q_master (n,) in `steps` steps, then waits. Returns the desired positions (m, n)."""
+        start = np.array(self.inputs["master_position"])
+        positions = [self.step(master_position=start + s * (q_master - start))[0] for s in np.linspace(0, 1, steps)]
+        return np.array(positions + [self.step()[0] for _ in range(steps)])
+
+    def flag(self, name):
+        return self.system.GetOutputPort(name).Eval(self.context)[0]
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -223,3 +287,63 @@ def test_other_invalid_arguments_are_refused():
     system = Teleoperation(MTM, PSM)
     with pytest.raises(ControllerError, match="input port master_position is not connected"):
         Simulator(system).Initialize()
+
+
+# Simulated teleoperation of a PSM by a master.
+
+
+@pytest.fixture(scope="module")
+def arms():
+    return TeleoperatedArms(MTM, PSM, scale=SCALE)
+
+
+def run(arms, duration=2.5):
+    """Returns the final states and poses after a hand moves, rotates and then holds the handle."""
+    simulator = Simulator(arms)
+    context = simulator.get_mutable_context()
+    arms.SetPositions(context, START_MASTER, START_FOLLOWER)
+    X_MG0, X_FT0 = arms.CalcX_MG(context), arms.CalcX_FT(context)
+    arms.GetInputPort("engaged").FixValue(context, [1.0])
+    for t in np.arange(0, duration, 0.01):
+        s = np.clip((t - 0.1) / 1.0, 0, 1)
+        target = RigidTransform(
+            RotationMatrix(RollPitchYaw(0.3 * s, -0.2 * s, 0.25 * s)) @ X_MG0.rotation(),
+            X_MG0.translation() + s * np.array([0.04, -0.03, 0.05]),
+        )
+        arms.GetInputPort("X_MG_desired").FixValue(context, AbstractValue.Make(target))
+        simulator.AdvanceTo(t + 0.01)
+    state = [arms.GetOutputPort(f"{name}.state_estimated").Eval(context) for name in ("mtml", "psm")]
+    return np.concatenate(state), (X_MG0, arms.CalcX_MG(context)), (X_FT0, arms.CalcX_FT(context)), target
+
+
+def test_simulated_follower_follows_the_hand(arms):
+    _, (G0, G), (T0, T), target = run(arms)
+    # The hand moves the gravity-compensated master to the desired pose without its weight.
+    assert np.linalg.norm(G.translation() - target.translation()) < 1e-4
+    way = SCALE * (G.translation() - G0.translation())
+    assert np.linalg.norm(way) > 0.02
+    assert np.linalg.norm(T.translation() - T0.translation() - way) < 5e-4
+    wanted = G.rotation() @ G0.rotation().inverse()
+    assert angle(wanted) > 0.3
+    assert angle(T.rotation() @ T0.rotation().inverse() @ wanted.inverse()) < 5e-3
+
+
+def test_master_and_follower_stay_without_a_hand(arms):
+    simulator = Simulator(arms)
+    context = simulator.get_mutable_context()
+    arms.SetPositions(context, START_MASTER, START_FOLLOWER)
+    arms.GetInputPort("engaged").FixValue(context, [1.0])
+    simulator.AdvanceTo(1.0)
+    q_M = arms.GetOutputPort("mtml.state_estimated").Eval(context)[:7]
+    q_F = arms.GetOutputPort("psm.state_estimated").Eval(context)[:7]
+    np.testing.assert_allclose(q_M, START_MASTER, atol=1e-4)
+    np.testing.assert_allclose(q_F, START_FOLLOWER, atol=1e-4)
+
+
+def test_pose_is_constant_outside_the_trajectory():
+    ends = [RigidTransform([0.0, 0, 0]), RigidTransform([2.0, 0, 0])]
+    source = PoseTrajectorySource(PiecewisePose.MakeLinear([1.0, 2.0], ends))
+    context = source.CreateDefaultContext()
+    for time, x in ((0.0, 0.0), (1.5, 1.0), (9.0, 2.0)):
+        context.SetTime(time)
+        assert source.get_output_port().Eval(context).translation()[0] == pytest.approx(x)

@@ -1,24 +1,44 @@
-"""Checks of simulated motions and poses, and the command `dvrk-drake check`."""
+"""`check` of simulated and real recordings: motions, poses, channels, times, and the command."""
 
 import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from check_findings import ARMS, changed, found
 from command_output import refusal
 from figure_rules import checked_figures
-from synthetic_motion import PERIOD, clean_motion
+from synthetic_motion import PERIOD, RATE, clean_motion
 
-from dvrk_drake.analysis.check.recording_check import check_recording
+from dvrk_drake.analysis.check.recording_check import check_recording, check_with_channels
 from dvrk_drake.analysis.observations.observations import Observations
+from dvrk_drake.analysis.observations.static_poses import check_effort_unit
+from dvrk_drake.analysis.observations.true_time import true_time
 from dvrk_drake.cli import main
+from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import holding_torques
+from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import MIN_ROWS, Recording
 from dvrk_drake.recordings.writing import write_recording
 
 pytestmark = pytest.mark.slow
+
+ARMS = "psm", "mtmr"
+
+
+def found(recording, name="psm"):
+    """Returns a mapping from a kind to the findings of `check` of this kind."""
+    report = check_recording(Observations(recording, load_arm(name)))
+    kinds = {}
+    for finding in report.findings:
+        kinds.setdefault(finding.kind, []).append(finding)
+    return kinds
+
+
+def changed(recording, block, joint, change):
+    values = getattr(recording, block).copy()
+    values[:, joint] = change(values[:, joint])
+    return replace(recording, **{block: values})
 
 
 @pytest.mark.parametrize("name", ARMS)
@@ -170,3 +190,264 @@ def test_command_refuses_with_exit_code_2(tmp_path, capsys):
     captured = capsys.readouterr()
     assert "milliseconds" in refusal(captured.err) and "milliseconds" not in captured.out
     assert captured.out.startswith("Verdict: unusable (wrong time)")
+
+
+# Checks of the channels of a motion: lag, sign, noise and unit of velocities and efforts.
+
+
+@pytest.mark.parametrize(("gain", "lag"), [(1.18, 0.0), (1.0, 0.010), (1.07, 0.008), (-1.0, 0.0), (180 / np.pi, 0.0)])
+def test_detects_a_wrong_velocity_gain_or_lag(gain, lag):
+    whole = clean_motion("mtmr")
+    late = changed(whole, "qd", 5, lambda x: gain * np.interp(whole.t - lag, whole.t, x))
+    kinds = found(late, "mtmr")
+    # Only the first four joints of an MTM share motors, so actuator 6 drives one joint.
+    assert [f.joints for f in kinds["velocity disagrees"]] == [(5,)]
+    report = check_recording(Observations(late, load_arm("mtmr")))
+    assert report.joints[5].velocity_gain == pytest.approx(gain, rel=5e-3)
+    assert report.joints[5].velocity_lag == pytest.approx(lag, abs=3e-4)
+
+
+def test_detects_velocities_that_are_always_zero():
+    whole = clean_motion()
+    assert len(found(replace(whole, qd=0 * whole.qd))["velocity disagrees"]) == 7
+
+
+@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize("joint", range(7))
+def test_refuses_an_effort_with_the_wrong_sign(name, joint):
+    arm = load_arm(name)
+    motors = clean_motion(name).in_actuator_coordinates(arm)
+    refusals = found(changed(motors, "tau", joint, lambda x: -x), name)["effort sign"]
+    assert [f.joints for f in refusals] == [(joint,)]
+    assert refusals[0].severity == "refusal"
+
+
+def test_detects_a_saturated_effort():
+    whole = clean_motion()
+    limit = np.quantile(whole.tau[:, 0], 0.95)
+    finding = found(changed(whole, "tau", 0, lambda x: np.minimum(x, limit)))["saturated effort"][0]
+    assert finding.joints == (0,)
+    assert finding.size == pytest.approx(0.05, abs=0.015)
+
+
+def test_saturation_at_both_limits_is_one_finding():
+    whole = clean_motion()
+    limit = np.quantile(np.abs(whole.tau[:, 0]), 0.8)
+    (finding,) = found(changed(whole, "tau", 0, lambda x: np.clip(x, -limit, limit)))["saturated effort"]
+    assert f"at {limit:.4g} N m in" in finding.what and f"at {-limit:.4g} N m in" in finding.what
+
+
+@pytest.mark.parametrize("step", [0.0, 1e-3])
+def test_constant_efforts_at_rest_are_not_saturated(step):
+    """The efforts are constant, or change by one step of a converter."""
+    whole, arm = clean_motion(), load_arm("psm")
+    tau = np.tile(0.05 * arm.effort_limits, (len(whole), 1))
+    tau[::7] += step
+    standing = replace(whole, q=0 * whole.q + whole.q[0], qd=0 * whole.qd, tau=tau)
+    kinds = found(standing)
+    assert len(kinds["never moves"]) == arm.num_joints and "saturated effort" not in kinds
+
+
+def test_refuses_efforts_in_another_unit():
+    assert found(changed(clean_motion(), "tau", 1, lambda x: 1000 * x))["unusable"][0].severity == "refusal"
+
+
+@pytest.mark.parametrize(
+    ("change", "advice"),
+    [(lambda tau: 1e3 * tau, "in N mm, give --effort-scale 0.001"), (lambda tau: tau[:, ::-1], "in reverse order")],
+)
+def test_the_cause_of_efforts_above_the_limits_is_named(change, advice):
+    arm = load_arm("mtmr")
+    rows = Recording(q=np.zeros((3, 7)), tau=np.tile(0.9 * arm.effort_limits, (3, 1)))
+    check_effort_unit(rows, arm)
+    with pytest.raises(RecordingError, match=advice):
+        check_effort_unit(replace(rows, tau=change(rows.tau)), arm)
+
+
+def test_exchanged_positions_and_efforts_are_named():
+    arm = load_arm("psm")
+    rows = Recording(q=np.tile(0.9 * arm.effort_limits, (3, 1)), tau=np.tile(arm.position_upper, (3, 1)))
+    with pytest.raises(RecordingError, match="if the positions and the efforts are exchanged"):
+        rows.check_fits(arm)
+
+
+def test_refuses_positions_in_degrees():
+    whole = clean_motion()
+    degrees = replace(whole, q=np.where(load_arm("psm").prismatic, whole.q, np.degrees(whole.q)))
+    assert "degrees" in found(degrees)["unusable"][0].advice
+
+
+def test_refuses_positions_in_millimetres():
+    assert "millimetres" in found(changed(clean_motion(), "q", 2, lambda x: 1000 * x))["unusable"][0].advice
+
+
+def test_refuses_effort_spikes_in_a_motion():
+    def spike(tau):
+        tau = tau.copy()
+        tau[[300, 700]] = 500.0
+        return tau
+
+    finding = found(changed(clean_motion(), "tau", 1, spike))["above effort limit"][0]
+    assert finding.severity == "refusal" and "2 rows" in finding.what
+
+
+# Checks of the times of a motion: repeated rows, jitter, gaps and wrong units.
+
+
+def test_detects_a_slower_effort_topic():
+    whole = clean_motion()
+    every_other = np.arange(len(whole)) // 2 * 2
+    kinds = found(replace(whole, tau=whole.tau[every_other]))
+    assert [f.where for f in kinds["repeated channel"]] == ["tau"]
+    assert kinds["repeated channel"][0].size == pytest.approx(0.5, abs=0.01)
+    assert "repeated rows" not in kinds
+
+
+def test_detects_a_gap_in_the_times():
+    whole = clean_motion()
+    keep = np.ones(len(whole), bool)
+    keep[1000:1100] = False
+    cut = replace(whole, q=whole.q[keep], qd=whole.qd[keep], tau=whole.tau[keep], t=whole.t[keep])
+    gap = found(cut)["gaps"][0]
+    assert gap.size == pytest.approx(101 / RATE, abs=1e-9)
+    assert "row 1001" in gap.what
+    assert set(found(cut)) == {"gaps", "repetition"}
+
+
+def test_refuses_decreasing_times():
+    whole = clean_motion()
+    t = whole.t.copy()
+    t[500] = t[498]
+    refusal = found(replace(whole, t=t))["time goes back"][0]
+    assert refusal.severity == "refusal"
+    assert "row 501" in refusal.what
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1000.0, "milliseconds"), (1e9, "nanoseconds"), (7 / 6, "wrong rate")])
+def test_refuses_times_in_another_unit(factor, unit):
+    whole = clean_motion()
+    refusal = found(replace(whole, t=whole.t * factor))["wrong time"][0]
+    assert refusal.severity == "refusal"
+    assert refusal.size == pytest.approx(factor, rel=1e-2)
+    assert unit in refusal.what
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_finds_time_that_stalls_at_repeated_rows(name):
+    """The rows are repeated while the recorded times continue, so the motion takes longer than in the arm."""
+    whole, arm = clean_motion(name), load_arm(name)
+    repeats = np.random.default_rng(6).random(len(whole)) < 0.12
+    index = np.repeat(np.arange(len(whole)), 1 + repeats)
+    t = np.arange(len(index)) / RATE
+    stalled = replace(whole, q=whole.q[index], qd=whole.qd[index], tau=whole.tau[index], t=t)
+    kinds = found(stalled, name)
+    (finding,) = kinds["repeated rows"]
+    assert finding.severity == "warning" and "removed from the times" in finding.advice
+    assert finding.size == pytest.approx(1 - len(whole) / len(index), abs=0.005)
+    assert "wrong time" not in kinds and "jitter" not in kinds
+    clock = true_time(stalled.in_actuator_coordinates(arm))
+    assert clock.t[-1] - clock.t[0] == pytest.approx(whole.t[-1] - whole.t[0], rel=0.005)
+    # The recorded times of a topic that is polled too fast are correct.
+    last = np.maximum.accumulate(np.where(repeats, 0, np.arange(len(whole))))
+    polled = replace(whole, q=whole.q[last], qd=whole.qd[last], tau=whole.tau[last])
+    (finding,) = found(polled, name)["repeated rows"]
+    assert "removed from the times" not in finding.advice and "line" not in finding.what
+
+
+@pytest.mark.parametrize("with_velocities", [True, False])
+def test_quantised_measurements_at_rest_are_not_repeated_rows(with_velocities):
+    """Half of the recording is at rest: positions and efforts are equal, with occasional changes by one count."""
+    whole = clean_motion()
+    count, half = 1e-4, len(whole) // 2
+    q, qd, tau = (np.array(x) for x in (whole.q, whole.qd, whole.tau))
+    flicker = np.random.default_rng(7).random(len(q) - half) < 0.05
+    q[half:], qd[half:], tau[half:] = q[half], 0.0, tau[half]
+    q = np.round(q / count) * count
+    q[half:, 0] += count * flicker
+    quiet = replace(whole, q=q, qd=qd if with_velocities else None, tau=np.round(tau, 3))
+    assert "repeated rows" not in found(quiet)
+    rows = np.arange(len(q))
+    rows[[100, 101, 300]] = 99, 99, 299
+    repeated = replace(quiet, q=q[rows], tau=quiet.tau[rows], qd=quiet.qd[rows] if with_velocities else None)
+    (finding,) = found(repeated)["repeated rows"]
+    assert finding.severity == "note" and finding.what.startswith("3 rows (")
+    assert f"first at {repeated.where(100)}" in finding.what
+
+
+# Checks of recordings of real arms: the findings agree with the README of the recordings.
+
+
+@pytest.fixture(scope="module")
+def real_motion(shared_data):
+    def motion(name):
+        path = shared_data / "trajectories" / f"{name}.csv"
+        if not path.is_file():
+            pytest.skip(f"needs {path}")
+        return read_recording(path, arm_of(name), "wpi")
+
+    return motion
+
+
+@pytest.fixture(scope="module")
+def real(real_motion):
+    return lambda name: check_recording(Observations(real_motion(name), arm_of(name)))
+
+
+def arm_of(name):
+    return load_arm(name.split("_")[0].replace("mtm", "mtmr"))
+
+
+def kinds_of(report):
+    kinds = {}
+    for finding in report.findings:
+        kinds.setdefault(finding.kind, []).append(finding)
+    return kinds
+
+
+def test_real_mtm(real):
+    report = real("mtm_one")
+    kinds = kinds_of(report)
+    assert report.refusals == ()
+    assert 0.11 <= kinds["repeated rows"][0].size <= 0.135
+    assert "jitter" in kinds
+    assert [f.joints[0] for f in kinds["velocity disagrees"]] == [4, 5, 6]
+    assert all(1.04 <= f.size <= 1.185 for f in kinds["velocity disagrees"])
+    assert max(joint.velocity_lag for joint in report.joints) <= 2.2 / 200
+    assert all(abs(joint.velocity_gain - 1) < 0.014 for joint in report.joints[:4])
+    assert round(report.period * 200) == 2333
+    assert 1 / report.period == pytest.approx(0.1 * 6 / 7, rel=2e-3)
+    np.testing.assert_allclose(
+        [100 * joint.floor for joint in report.joints], [4.5, 15.2, 6.7, 4.3, 16.3, 10.3, 19.2], atol=0.055
+    )
+
+
+def test_real_psm(real):
+    report = real("psm_one")
+    kinds = kinds_of(report)
+    assert report.refusals == ()
+    assert "repeated rows" not in kinds
+    assert "velocity disagrees" not in kinds
+    assert all(abs(joint.velocity_gain - 1) < 0.014 for joint in report.joints)
+    assert round(report.period * 200) == 1296
+    assert 1 / report.period == pytest.approx(0.18 * 6 / 7, rel=2e-3)
+    np.testing.assert_allclose(
+        [100 * joint.floor for joint in report.joints], [1.4, 2.0, 15.3, 3.1, 1.4, 1.9, 2.2], atol=0.055
+    )
+
+
+@pytest.mark.parametrize("name", ["psm_one", "psm_one_no_weight", "psm_one_105g_parallel", "psm_one_205g_insertion"])
+def test_real_insertion_has_noise_and_effort_lag(real, name):
+    kinds = kinds_of(real(name))
+    assert (2,) in [f.joints for f in kinds["narrow-band noise"]]
+    # An analysis of these recordings found a lag of 0.75 samples at 200 Hz.
+    lag = next(f for f in kinds["effort lag"] if f.joints == (2,))
+    assert lag.size == pytest.approx(0.75 / 200, abs=0.002)
+
+
+@pytest.mark.parametrize("name", ["mtm_one", "psm_one"])
+@pytest.mark.parametrize("joint", [0, 2, 4, 6])
+def test_refuses_a_wrong_sign_in_a_real_motion(real_motion, name, joint):
+    arm = arm_of(name)
+    motors = changed(real_motion(name).in_actuator_coordinates(arm), "tau", joint, lambda x: -x)
+    refusals = check_with_channels(Observations(motors, arm)).refusals
+    assert [(f.kind, f.joints) for f in refusals] == [("effort sign", (joint,))]
