@@ -42,6 +42,10 @@ _DEFLECTION = 0.004, 0.0004
 #: efforts, a joint oscillates about the edge of a count.
 _COUNT_SHARE = 0.2
 
+#: Largest effort of the play of a spring of mode "guide", as a share of the dry friction of the joint. The dry friction
+#: then dissipates at least twice the energy that the play creates.
+_PLAY_SHARE = 0.5
+
 #: Largest ratio of the stiffness of a spring of mode "guide" to the gain Kp. It doubles the bandwidth, so the phase
 #: margin at the delays of the velocity filter and of the messages remains large enough.
 _MAX_STIFFENING = 4.0
@@ -199,7 +203,7 @@ class GravityPidController(LeafSystem):
         # Reading one cache entry at each update is faster than reading each parameter.
         self._settings = self.DeclareCacheEntry(
             "settings",
-            ValueProducer(allocate=lambda: AbstractValue.Make((np.zeros((12, n)), 0)), calc=self._calc_settings),
+            ValueProducer(allocate=lambda: AbstractValue.Make((np.zeros((13, n)), 0)), calc=self._calc_settings),
             {self.all_parameters_ticket()},
         )
         holding = model.static_model.with_parameters(model.theta)
@@ -255,8 +259,8 @@ class GravityPidController(LeafSystem):
         mode = int(context.get_numeric_parameter(self._mode).GetAtIndex(0))
         settings.set_value((np.vstack([per_joint, self._constants, *self._springs(*per_joint)]), mode))
 
-    def _springs(self, kp: Vector, kd: Vector, ki: Vector, slip: Vector) -> tuple[Vector, Vector, Vector]:
-        """Returns stiffness and damping of the springs of mode "guide", and the largest damping of a free joint.
+    def _springs(self, kp: Vector, kd: Vector, ki: Vector, slip: Vector) -> tuple[Vector, ...]:
+        """Returns stiffness and damping of the springs of mode "guide", largest damping of a free joint, and play.
 
         Without the dry friction, the slip effort is the error of the model, which lets a free joint drift.
         """
@@ -265,7 +269,9 @@ class GravityPidController(LeafSystem):
         stiffness = np.clip(slip / np.maximum(deflection, counts / _COUNT_SHARE), kp, _MAX_STIFFENING * kp)
         damping = np.sqrt(np.divide(stiffness, kp, out=np.ones_like(kp), where=kp > 0)) * kd
         damping = np.minimum(damping, _COUNT_SHARE * slip * RATE_TIME / counts)
-        return stiffness, damping, np.maximum(slip - self._arm.dry_friction(), 0.0)
+        dry = self._arm.dry_friction()
+        play = np.minimum(0.5 * counts, _PLAY_SHARE * dry / np.maximum(stiffness, np.finfo(float).tiny))
+        return stiffness, damping, np.maximum(slip - dry, 0.0), play
 
     def _make_update(self, holding: HoldingArrays, restart: bool) -> Callable[[Context, DiscreteValues], None]:
         """Returns the handler of an update event.

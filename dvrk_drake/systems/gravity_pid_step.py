@@ -47,18 +47,18 @@ def controller_step(
         restart: True for the update at initialization.
         period: Period of the update [s].
         mode: Index into `Mode`.
-        per_joint: Rows (12, n): kp, kd, ki, slip effort, feedforward scale and effort limits, then rest, travel, jump,
-            stiffness, damping and drift of `virtual_friction`.
+        per_joint: Rows (13, n): kp, kd, ki, slip effort, feedforward scale and effort limits, then rest, travel, jump,
+            stiffness, damping, drift and play of `virtual_friction`.
         model: Model of the holding torque.
         effort, gravity, fault, integral: Results, which the function writes into these arrays. `fault` has one number.
         latched_q: Pose that is regulated if `has_desired` is False; NaN before the first pose.
         last_q: Last valid pose; NaN before the first pose.
-        springs: State (7n) of the virtual friction.
+        springs: State (8n) of the virtual friction.
     """
     n = effort.size
     kp, kd, ki, slip, feedforward_scale = per_joint[0], per_joint[1], per_joint[2], per_joint[3], per_joint[4]
     limit, rest, travel, jump = per_joint[5], per_joint[6], per_joint[7], per_joint[8]
-    stiffness, damping, drift = per_joint[9], per_joint[10], per_joint[11]
+    stiffness, damping, drift, play = per_joint[9], per_joint[10], per_joint[11], per_joint[12]
     hold, damped = mode == HOLD, mode == DAMPED
 
     if restart:
@@ -77,7 +77,7 @@ def controller_step(
         detach(period, springs, effort)
     else:
         q, v, guide = state[:n], state[n:], mode == GUIDE
-        settings = period, damping, slip, stiffness, drift, rest, travel, jump
+        settings = period, damping, slip, stiffness, drift, rest, travel, jump, play
         virtual_friction(q, v, last_q, guide, *settings, springs, effort)
         for i in range(n):
             last_q[i] = state[i]

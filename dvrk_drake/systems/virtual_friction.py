@@ -30,20 +30,30 @@ PLACE_TIME = 1.0
 #: Time constant [s] of the velocity for the damping, as that of the velocity that a dVRK measures (30 Hz).
 RATE_TIME = 0.005
 
+#: Time at rest [s] after which the play begins to widen, and time in which it reaches its full width. A play at the
+#: release would add half an encoder count to the distance that a joint moves until its spring holds it. The spring
+#: holds a released joint after less than 1 s.
+PLAY_START, PLAY_TIME = 1.0, 1.0
+
 #: Number of state variables per joint: effort of the spring, its strength (share of the slip effort), place at which it
-#: attached (NaN: detached), the two filtered positions (NaN: unknown), time at rest, and velocity.
-NUM_STATES = 7
+#: attached (NaN: detached), the two filtered positions (NaN: unknown), time at rest, velocity, and position after the
+#: play.
+NUM_STATES = 8
 
 
 @compiled
 def virtual_friction(
-    q, v, last_q, acts, period, kd, slip, stiffness, drift, rest, travel, jump, memory, effort
+    q, v, last_q, acts, period, kd, slip, stiffness, drift, rest, travel, jump, play, memory, effort
 ):  # pragma: no cover - compiled
     """Advances the virtual friction of n joints by one period and subtracts its effort from `effort`.
 
     The element of a joint is elasto-plastic, as dry friction: a spring that slides at its strength. The strength is the
     slip effort at rest, and decays to zero after the joint has moved away. The element is passive. Its spring stores
     only energy of the motion that deflects it. Sliding and a decaying strength only reduce the stored energy.
+
+    The position of a joint at rest may alternate between two encoder counts. The spring would follow it, and the joint
+    would oscillate. The spring therefore has a play after some time at rest. In a motion, the play acts as a negative
+    dry friction of stiffness times play, which must be smaller than the dry friction of the joint.
 
     Args:
         q, v: Position and velocity (n,) of the joints.
@@ -59,22 +69,26 @@ def virtual_friction(
         rest: Distances (n,) by which the slow motion of a joint at rest may differ from its second filter.
         travel: Distances (n,) from the place of the spring at which it breaks away.
         jump: Distances (n,) that no joint moves in one period.
-        memory: State (7 n,), see `NUM_STATES`.
+        play: Half widths (n,) of the play: half an encoder count, or 0.
+        memory: State (8 n,), see `NUM_STATES`.
         effort: Efforts (n,).
     """
     n = q.size
     spring, strength, place = memory[:n], memory[n : 2 * n], memory[2 * n : 3 * n]
     first, second, rested = memory[3 * n : 4 * n], memory[4 * n : 5 * n], memory[5 * n : 6 * n]
-    rate, num_moving = memory[6 * n :], 0
+    rate, played, num_moving = memory[6 * n : 7 * n], memory[7 * n :], 0
     gain, rate_gain = period / (FILTER_TIME + period), period / (RATE_TIME + period)
     for i in range(n):
-        step = q[i] - last_q[i]
-        unknown = np.isnan(first[i])
-        if unknown or not abs(step) <= jump[i] + 2.0 * period * abs(v[i]):  # also for NaN
-            step, first[i], second[i] = 0.0, q[i], q[i]
+        last, unknown = last_q[i], np.isnan(first[i])
+        if unknown or not abs(q[i] - last) <= jump[i] + 2.0 * period * abs(v[i]):  # also for NaN
+            last = first[i] = second[i] = played[i] = q[i]
             place[i], rested[i], rate[i] = np.nan, 0.0, 0.0
             if unknown and abs(v[i]) * FILTER_TIME <= rest[i]:
                 rested[i] = REST_TIME  # an arm that does not move at the start was at rest before
+        width = play[i] * min(max(rested[i] - PLAY_START, 0.0) / PLAY_TIME, 1.0)
+        before = min(max(played[i], last - width), last + width)  # a narrower play does not change the effort
+        played[i] = min(max(before, q[i] - width), q[i] + width)
+        step = played[i] - before
         spring[i] += stiffness[i] * step
         rate[i] += rate_gain * (step / period - rate[i])
         first[i] += gain * (q[i] - first[i])
@@ -124,7 +138,7 @@ def attach(gravity, effort, slip, memory):  # pragma: no cover - compiled
     Args:
         gravity, effort: Gravity effort and effort (n,) of the last period in mode "hold".
         slip: Efforts (n,) at which the springs slide.
-        memory: State (7 n,), see `NUM_STATES`.
+        memory: State (8 n,), see `NUM_STATES`.
     """
     n = effort.size
     for i in range(n):
