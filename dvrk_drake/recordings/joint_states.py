@@ -6,7 +6,6 @@ joint coordinates (https://dvrk.readthedocs.io, CRTK names). A header stamp of 0
 
 from __future__ import annotations
 
-import math
 from array import array
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -89,64 +88,55 @@ def collect_joint_states(
             not finite, or the clock was set.
     """
     names: tuple[str, ...] = ()
-    stamps, numbers = array("q"), array("q")
-    blocks = {name: array("d") for name in MESSAGE_BLOCKS}
-    missing: dict[str, list[int]] = {name: [] for name in MESSAGE_BLOCKS}
-    unstamped, invalid = 0, 0
+    stamps, numbers, values, present, unstamped = array("q"), array("q"), array("d"), array("b"), 0
     for message in messages:
         where = f"{path}: {label} {message.number} of {topic}"
         if message.stamp == 0:
             unstamped += 1
             continue
-        if not names:
-            names = tuple(message.name)
-            _check_names(where, names)
-        elif tuple(message.name) != names:
+        names = names or _checked_names(where, message.name)
+        if tuple(message.name) != names:
             raise RecordingError(
                 f"{where} has the joints {', '.join(message.name)}, but the first one has {', '.join(names)}. Choose a "
                 "topic with one publisher."
             )
-        rows = {name: np.asarray(getattr(message, name), float) for name in MESSAGE_BLOCKS}
-        absent = [name for name, row in rows.items() if not len(row)]
-        if "position" in absent:
-            raise RecordingError(f"{where} has no positions")
-        for name, row in rows.items():
-            if name not in absent and len(row) != len(names):
-                raise RecordingError(f"{where} has {len(row)} numbers in `{name}`, but {len(names)} joints")
-        if not math.isfinite(sum(float(row.sum()) for row in rows.values())):
-            if not skip_invalid:
-                raise RecordingError(_not_finite(where, names, rows))
-            invalid += 1
-            continue
-        for name in absent:
-            missing[name].append(message.number)
-            rows[name] = np.full(len(names), np.nan)
         stamps.append(message.stamp)
         numbers.append(message.number)
-        for name, block in blocks.items():
-            block.frombytes(rows[name].tobytes())
-    reasons = {"header stamp 0, which marks invalid data": unstamped, "not finite": invalid}
+        for block in MESSAGE_BLOCKS:
+            row = np.asarray(getattr(message, block), float)
+            if not len(row) and block == "position":
+                raise RecordingError(f"{where} has no positions")
+            if len(row) not in (0, len(names)):
+                raise RecordingError(f"{where} has {len(row)} numbers in `{block}`, but {len(names)} joints")
+            present.append(len(row) > 0)
+            values.frombytes((row if len(row) else np.zeros(len(names))).tobytes())
+    shape = len(stamps), len(MESSAGE_BLOCKS)
+    table, has = np.frombuffer(values).reshape(*shape, len(names)), np.frombuffer(present, bool).reshape(shape)
+    is_valid = np.all(np.isfinite(table), axis=(1, 2))
+    if not (skip_invalid or np.all(is_valid)):
+        row, block, joint = np.argwhere(~np.isfinite(table))[0]
+        raise RecordingError(
+            f"{path}: {label} {numbers[row]} of {topic}: the {MESSAGE_BLOCKS[block]} of {names[joint]} is "
+            f"{table[row, block, joint]}; only finite numbers are allowed (--skip-invalid omits such messages)"
+        )
+    reasons = {"header stamp 0, which marks invalid data": unstamped, "not finite": int(np.sum(~is_valid))}
     notes = [f"{count} messages of {topic} omitted: {reason}" for reason, count in reasons.items() if count]
-    if not stamps:
+    if not np.any(is_valid):
         raise RecordingError(f"{path}: {topic} has no usable message ({'; '.join(notes) or 'it has no messages'})")
-    for name, absent_in in missing.items():
-        if len(absent_in) == len(stamps):
-            del blocks[name]
-        elif absent_in and name == "velocity":
-            del blocks[name]
-            notes.append(f"velocities of {topic} not used: {len(absent_in)} of {len(stamps)} messages have none")
-        elif absent_in:
-            has = next(number for number in numbers if number not in set(absent_in))
-            raise RecordingError(
-                f"{path}: {label} {absent_in[0]} of {topic} has no {name}, but {label} {has} has. Cut the recording."
-            )
-    stamp_array, number_array = np.frombuffer(stamps, np.int64), np.frombuffer(numbers, np.int64)
-    order, time_notes = order_in_time(path, f"messages of {topic}", stamp_array, number_array, label)
-    table = {name: np.frombuffer(block).reshape(len(stamps), -1)[order] for name, block in blocks.items()}
-    return JointStates(
-        *(topic, names, stamp_array[order], table["position"], table.get("velocity"), table.get("effort")),
-        *(number_array[order], (*notes, *time_notes), label),
-    )
+    table, has = table[is_valid], has[is_valid]
+    stamp, number = np.frombuffer(stamps, np.int64)[is_valid], np.frombuffer(numbers, np.int64)[is_valid]
+    is_partial = np.any(has, axis=0) & ~np.all(has, axis=0)
+    if is_partial[1]:
+        notes.append(f"velocities of {topic} not used: {np.sum(~has[:, 1])} of {len(has)} messages have none")
+    if is_partial[2]:
+        without, with_effort = number[np.argmin(has[:, 2])], number[np.argmax(has[:, 2])]
+        raise RecordingError(
+            f"{path}: {label} {without} of {topic} has no effort, but {label} {with_effort} has. Cut the recording."
+        )
+    order, time_notes = order_in_time(path, f"messages of {topic}", stamp, number, label)
+    q, qd, tau = (table[order, i] if np.all(has[:, i]) else None for i in range(len(MESSAGE_BLOCKS)))
+    assert q is not None
+    return JointStates(topic, names, stamp[order], q, qd, tau, number[order], (*notes, *time_notes), label)
 
 
 def joint_recording(
@@ -214,22 +204,12 @@ def arm_joint_names(
     return read, notes
 
 
-def _check_names(where: str, names: tuple[str, ...]) -> None:
+def _checked_names(where: str, names: Sequence[str]) -> tuple[str, ...]:
     if not names:
         raise RecordingError(f"{where} names no joints")
     if len(set(names)) < len(names):
         raise RecordingError(f"{where} names a joint twice: {', '.join(names)}")
-
-
-def _not_finite(where: str, names: tuple[str, ...], rows: Mapping[str, NDArray[np.float64]]) -> str:
-    for block, row in rows.items():
-        for joint, value in zip(names, row, strict=False):
-            if not math.isfinite(value):
-                return (
-                    f"{where}: the {block} of {joint} is {value}; only finite numbers are allowed (--skip-invalid "
-                    "omits such messages)"
-                )
-    return f"{where} has numbers that are too large"
+    return tuple(names)
 
 
 def order_in_time(
@@ -311,19 +291,10 @@ def _with_jaw(path: Path, arm: JointStates, jaw: JointStates, joint: str) -> tup
         notes.append(f"velocities of {arm.topic} not used: the topic of the jaw has none")
     if omitted := int(np.sum(~kept)):
         notes.append(f"{omitted} messages of the arm omitted: no message of the jaw within {1e3 * MAX_JAW_GAP:g} ms")
-    q = joined(arm.q, jaw.q)
+    q, qd, tau = (joined(*pair) for pair in ((arm.q, jaw.q), (arm.qd, jaw.qd), (arm.tau, jaw.tau)))
     assert q is not None
-    joined_states = JointStates(
-        arm.topic,
-        (*arm.names, joint),
-        arm.stamps[kept],
-        q,
-        joined(arm.qd, jaw.qd),
-        joined(arm.tau, jaw.tau),
-        arm.numbers[kept],
-        (),
-    )
-    return joined_states, notes
+    names, stamps, numbers = (*arm.names, joint), arm.stamps[kept], arm.numbers[kept]
+    return arm._replace(names=names, stamps=stamps, q=q, qd=qd, tau=tau, numbers=numbers), notes
 
 
 def _joint_order(path: Path, topic: str, names: tuple[str, ...], arm: Arm) -> list[int]:

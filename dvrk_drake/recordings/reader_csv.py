@@ -1,8 +1,6 @@
 """Reads recordings from CSV files with a header, and from CSV files without a header that have a known layout.
 
 A file with the columns of messages sensor_msgs/JointState is read like a topic of a ROS bag.
-
-The module `layouts` contains the layouts without a header.
 """
 
 from __future__ import annotations
@@ -11,9 +9,11 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_files import is_package_arm
 from dvrk_drake.models.locked_joints import lock_hint
 from dvrk_drake.recordings.csv_rows import (
     CsvFile,
@@ -24,9 +24,8 @@ from dvrk_drake.recordings.csv_rows import (
     read_numbers,
 )
 from dvrk_drake.recordings.joint_states import MESSAGE_BLOCKS, JointState, collect_joint_states, joint_recording
-from dvrk_drake.recordings.layouts import Layout, find_layout
 from dvrk_drake.recordings.reader_options import FileOptions, instrument_notes, sha256_of
-from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.recordings.recording import FileCoordinates, Recording
 from dvrk_drake.recordings.topic_choice import check_namespace
 from dvrk_drake.recordings.writer_csv import UNITS
 
@@ -46,6 +45,8 @@ _QUANTITIES = {
     **dict.fromkeys(("velocity", "vel"), "qd"),
     **dict.fromkeys(("effort", "torque", "force"), "tau"),
 }
+#: Number of joints of the arms that WPI recorded without a header.
+_WPI_JOINTS = 7
 #: Names of the column with the times in a file whose columns have the names of joints.
 _TIME_NAMES = ("t", "time", "timestamp")
 
@@ -77,13 +78,13 @@ def read_csv(path: Path, options: FileOptions) -> Recording:
     if is_headerless and comments and len(comments[-1][1]) == len(cells) and not any(map(is_number, comments[-1][1])):
         # np.savetxt writes the header as a comment.
         is_headerless, (line, cells) = False, comments[-1]
-    where, layout = f"{path}, line {line}", Layout(())
+    where, layout = f"{path}, line {line}", _Layout([])
     if fields := _message_fields(where, cells):
         topic = next((comment[0][7:] for _, comment in comments if comment[0].startswith("Topic: ")), "")
         return _read_messages(file, line, cells, fields, topic, options)
     if is_headerless:
         layout = _layout(path, where, len(cells), options)
-        line, cells = line - 1, layout.columns(n)
+        line, cells = line - 1, layout.columns
     header, units = _split_units(cells)
     blocks = _columns_of_blocks(where, _with_numbers(where, header, options), options)
     stated = _stated(file, line, header, arm)
@@ -221,11 +222,27 @@ def _check_units(
                 )
 
 
-def _layout(path: Path, where: str, width: int, options: FileOptions) -> Layout:
-    """Returns the layout of a file without a header."""
+class _Layout(NamedTuple):
+    """Names of the columns of a file without a header, "" if ignored; rate [Hz] of a motion; coordinates."""
+
+    columns: list[str]
+    rate: float | None = None
+    coordinates: FileCoordinates | None = None
+
+
+def _layout(path: Path, where: str, width: int, options: FileOptions) -> _Layout:
+    """Returns the layout of a file without a header, from its number of columns."""
     arm, n = options.arm, options.num_joints
-    if layout := find_layout(width, arm, n):
-        return layout
+    columns = {name: [f"{name}{i}" for i in range(1, n + 1)] for name in ("q", "qd", "tau")}
+    if width == 3 * n:
+        # Motions of WPI (https://github.com/WPI-AIM/dvrk_dynamics_identification).
+        is_wpi = n == _WPI_JOINTS and (arm is None or is_package_arm(arm))
+        return _Layout([*columns["q"], *columns["qd"], *columns["tau"]], *((200.0, "wpi") if is_wpi else ()))
+    # Script `dvrk_ecm_psm_gc_collect.py` of the dVRK (https://github.com/jhu-dvrk/dvrk_python), for three joints. In
+    # static poses of WPI (https://github.com/WPI-AIM/dvrk_gravity_comp), a column of the gripper follows the joints.
+    has_gripper = n == _WPI_JOINTS and width == 2 * n + 2
+    if width == 2 * n or has_gripper:
+        return _Layout([name for prefix in ("q", "tau") for name in (*columns[prefix], *[""] * has_gripper)])
     message = (
         f"{where}: the first row has {width} cell{'s' * (width != 1)} and no header. Allowed without a header for {n} "
         f"joints: {3 * n} columns (q, qd, tau) or {2 * n} (q, tau)"

@@ -42,49 +42,31 @@ class LcmEvent(NamedTuple):
     data: bytes
 
 
-class LcmLogReader:
+def read_events(path: Path, notes: list[str]) -> Iterator[LcmEvent]:
     """Iterates over the events of a log in order, and skips damaged events.
 
-    Attributes:
+    Args:
         path: Path of the log.
-        notes: Descriptions of damage, complete after the iteration.
+        notes: List to which descriptions of damage are appended.
+
+    Raises:
+        RecordingError: The file cannot be read.
     """
-
-    def __init__(self, path: Path) -> None:
-        """Opens the log at `path`, which must begin with an event.
-
-        Raises:
-            RecordingError: The file cannot be read, or does not begin like an LCM log.
-        """
-        if not is_lcm_log(path):
-            raise RecordingError(f"{path} is not an LCM log")
-        self.path = path
-        self.notes: list[str] = []
-
-    def __iter__(self) -> Iterator[LcmEvent]:
-        self.notes.clear()
-        with (
-            open_input(self.path, RecordingError) as file,
-            mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content,
-        ):
-            position = 0
-            while position < len(content):
-                end = _end_of_event(content, position)
-                if end:
-                    yield _event(content, position)
-                    position = end
+    with open_input(path, RecordingError) as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        position = 0
+        while position < len(content):
+            event, end = _event(content, position)
+            if event:
+                yield event
+            else:
+                while (end := content.find(_MAGIC, end + 1)) >= 0 and not _event(content, end)[0]:
+                    pass
+                if end >= 0:
+                    notes.append(f"{end - position} damaged bytes skipped, from byte {position}")
                 else:
-                    position = self._skip(content, position)
-
-    def _skip(self, content: mmap.mmap, damaged: int) -> int:
-        """Returns the position of the next complete event after a damaged one, or the end of the file."""
-        position = damaged
-        while (position := content.find(_MAGIC, position + 1)) >= 0:
-            if _end_of_event(content, position):
-                self.notes.append(f"{position - damaged} damaged bytes skipped, from byte {damaged}")
-                return position
-        self.notes.append(f"incomplete message skipped at the end of the log ({len(content) - damaged} bytes)")
-        return len(content)
+                    end = len(content)
+                    notes.append(f"incomplete message skipped at the end of the log ({end - position} bytes)")
+            position = end
 
 
 def is_lcm_log(path: Path) -> bool:
@@ -101,28 +83,23 @@ def event_bytes(event: LcmEvent) -> bytes:
     return _HEADER.pack(_MAGIC, event.number, event.utime, len(channel), len(event.data)) + channel + event.data
 
 
-def _end_of_event(content: mmap.mmap, start: int) -> int:
-    """Returns the end of the event that begins at `start`.
+def _event(content: mmap.mmap, start: int) -> tuple[LcmEvent | None, int]:
+    """Returns the event that begins at `start`, and its end.
 
-    The result is 0 if there is no event at `start`, or if neither an event nor the end of the file follows.
+    The result is (None, `start`) if there is no event, or if neither an event nor the end of the file follows.
     """
-    if start + _HEADER.size > len(content):
-        return 0
-    magic, _, _, channel_length, data_length = _HEADER.unpack_from(content, start)
-    end = start + _HEADER.size + channel_length + data_length
-    if magic != _MAGIC or not 0 < channel_length <= _MAX_CHANNEL or end > len(content):
-        return 0
-    following = content[end : end + len(_MAGIC)]
-    return end if _MAGIC.startswith(following) else 0
-
-
-def _event(content: mmap.mmap, start: int) -> LcmEvent:
-    _, number, utime, channel_length, data_length = _HEADER.unpack_from(content, start)
     channel = start + _HEADER.size
+    if channel > len(content):
+        return None, start
+    magic, number, utime, channel_length, data_length = _HEADER.unpack_from(content, start)
     data = channel + channel_length
+    end = data + data_length
+    if magic != _MAGIC or not 0 < channel_length <= _MAX_CHANNEL or end > len(content):
+        return None, start
+    if not _MAGIC.startswith(content[end : end + len(_MAGIC)]):
+        return None, start
     # Channels that are not UTF-8 are not used, but must not raise an error.
-    name = content[channel:data].decode("utf-8", "replace")
-    return LcmEvent(number, utime, name, content[data : data + data_length])
+    return LcmEvent(number, utime, content[channel:data].decode("utf-8", "replace"), content[data:end]), end
 
 
 _UNREADABLE = f"not an lcmt_dvrk_status of version {MESSAGE_VERSION}"
@@ -250,26 +227,22 @@ def read_status_log(path: Path, options: FileOptions) -> Recording:
     arm = options.arm
     if arm is not None and arm.locked_joints:
         raise RecordingError(f"{path}: an LCM log contains all joints of {arm.name}, so --locked is not accepted")
-    log = LcmLogReader(path)
-    channel = status_channel(arm) if arm else _only_status_channel(log)
-    stream = StatusStream(arm.name, arm.num_joints) if arm else None
-    rows, times, events = array("d"), array("d"), array("q")
+    channel, stream = (status_channel(arm), StatusStream(arm.name, arm.num_joints)) if arm else _only_stream(path)
+    rows, times, events, damage = array("d"), array("d"), array("q"), list[str]()
     channels: Counter[str] = Counter()
-    for event in log:
+    for event in read_events(path, damage):
         channels[event.channel] += 1
         if event.channel != channel:
             continue
-        if stream is None and (first := decode(lcmt_dvrk_status, event.data)):
-            stream = StatusStream(first.arm_name, first.num_joints)
         try:
-            status = stream.accept(event.data) if stream else None
+            status = stream.accept(event.data)
         except RecordingError as error:
             raise RecordingError(f"{path}: event {event.number}: {error}") from error
-        if status is not None and stream is not None:
+        if status is not None:
             rows.extend(measurements(status))
             times.append(stream.time(status))
             events.append(event.number)
-    notes = [*log.notes, *(stream.notes() if stream else [])]
+    notes = [*damage, *stream.notes()]
     if not events:
         raise RecordingError(f"{path}: {_no_usable_status(channel, arm, channels, notes)}")
     order = np.argsort(times, kind="stable")
@@ -283,13 +256,18 @@ def read_status_log(path: Path, options: FileOptions) -> Recording:
     )
 
 
-def _only_status_channel(log: LcmLogReader) -> str:
-    channels = sorted({event.channel for event in log if event.channel.startswith(STATUS_PREFIX)})
-    if len(channels) > 1:
+def _only_stream(path: Path) -> tuple[str, StatusStream]:
+    """Returns the only channel with statuses, and the stream of the arm of its first readable status."""
+    first: dict[str, lcmt_dvrk_status | None] = {}
+    for event in read_events(path, []):
+        if event.channel.startswith(STATUS_PREFIX) and not first.get(event.channel):
+            first[event.channel] = decode(lcmt_dvrk_status, event.data)
+    if len(first) > 1:
         raise RecordingError(
-            f"{log.path} has statuses of several arms ({', '.join(channels)}). Select one with --arm (arm= in Python)."
+            f"{path} has statuses of several arms ({', '.join(sorted(first))}). Select one with --arm (arm= in Python)."
         )
-    return channels[0] if channels else STATUS_PREFIX
+    channel, status = next(iter(first.items()), (STATUS_PREFIX, None))
+    return channel, StatusStream(status.arm_name, status.num_joints) if status else StatusStream("", 0)
 
 
 def _no_usable_status(channel: str, arm: Arm | None, channels: Counter[str], notes: list[str]) -> str:

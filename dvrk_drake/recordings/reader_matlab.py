@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.files import read_input
 from dvrk_drake.recordings.csv_rows import listed
-from dvrk_drake.recordings.layouts import WPI_POSES
 from dvrk_drake.recordings.reader_options import FileOptions, sha256_of
 from dvrk_drake.recordings.recording import Recording
 
@@ -48,9 +47,9 @@ _NAMES = {
     ),
     "t": ("t", "time", "times", "timestamp", "timestamps"),
 }
-#: First dimensions (joints and gripper; position, effort) of an array of static poses. It is allocated before the
+#: First dimensions (7 joints and gripper; position, effort) of an array of static poses. It is allocated before the
 #: measurement, so a pose of only zeros was not recorded.
-_POSE_SHAPE = 8, 2
+_POSE_SHAPE, _POSE_JOINTS = (8, 2), 7
 #: Maximum number of arrays listed in a message.
 _LISTED = 12
 
@@ -296,7 +295,7 @@ def _chosen(path: Path, content: _Content, n: int, names: Mapping[str, str]) -> 
             chosen[quantity] = fitting[0]
     if "q" in chosen:
         return chosen
-    poses = [name for name, array in content.arrays.items() if _is_pose_array(array) and n == WPI_POSES.num_joints]
+    poses = [name for name, array in content.arrays.items() if _is_pose_array(array) and n == _POSE_JOINTS]
     if names or not poses:
         raise RecordingError(
             f"{path}: no array of {n} joints has a recognised name. Name the arrays with --arrays q=NAME tau=NAME "
@@ -326,17 +325,12 @@ def _is_pose_array(array: NDArray) -> bool:
 
 
 def _poses(path: Path, name: str, array: NDArray, n: int) -> _Rows:
-    if n != WPI_POSES.num_joints:
-        raise RecordingError(f"{path}: an array of poses contains {WPI_POSES.num_joints} joints, but the arm has {n}")
+    if n != _POSE_JOINTS:
+        raise RecordingError(f"{path}: an array of poses contains {_POSE_JOINTS} joints, but the arm has {n}")
     if not _is_pose_array(array):
         raise RecordingError(f"{path}: {name} is {_shape(array)}; allowed: 8 x 2 x N (joint; position, effort; pose)")
-    table = np.asarray(array, float).reshape(*_POSE_SHAPE, -1).transpose(2, 1, 0).reshape(-1, np.prod(_POSE_SHAPE))
-    names = WPI_POSES.columns(n)
-    blocks = {
-        quantity: table[:, [names.index(f"{quantity}{i}") for i in range(1, n + 1)]]
-        for quantity in WPI_POSES.quantities
-    }
-    return _Rows(blocks, f"static poses from array {name}; its eighth row (gripper) is ignored", "pose")
+    q, tau = np.asarray(array, float).reshape(*_POSE_SHAPE, -1).transpose(1, 2, 0)[..., :n]
+    return _Rows({"q": q, "tau": tau}, f"static poses from array {name}; its eighth row (gripper) is ignored", "pose")
 
 
 def _valid_rows(path: Path, blocks: Mapping[str, NDArray], label: str, skip_invalid: bool) -> NDArray[np.bool_]:

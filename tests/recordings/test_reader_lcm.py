@@ -19,7 +19,7 @@ from dvrk_drake.errors import RecordingError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings import writer_mcap
-from dvrk_drake.recordings.reader_lcm import LcmLogReader, StatusStream
+from dvrk_drake.recordings.reader_lcm import StatusStream, read_events
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.writer_stream import check_stream_output, open_recording_file
 
@@ -56,8 +56,8 @@ def test_reads_logs_written_by_lcm(tmp_path):
 def test_lcm_reads_logs_of_this_package(tmp_path):
     path = write_log(tmp_path / "a.log", statuses())
     events = list(lcm.EventLog(str(path)))
-    read_events = list(LcmLogReader(path))
-    assert [(e.eventnum, e.timestamp, e.channel, e.data) for e in events] == [tuple(e) for e in read_events]
+    own = list(read_events(path, []))
+    assert [(e.eventnum, e.timestamp, e.channel, e.data) for e in events] == [tuple(e) for e in own]
     assert [e.data for e in events] == [s.encode() for s in statuses()]
 
 

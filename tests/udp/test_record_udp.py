@@ -23,7 +23,7 @@ from status_logs import ARM, log_bytes, statuses
 from waiting import TIMEOUT, wait_until
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
-from dvrk_drake.recordings.reader_lcm import LcmLogReader, measurements
+from dvrk_drake.recordings.reader_lcm import measurements, read_events
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.writer_mcap import CHUNK_TIME
 
@@ -60,7 +60,7 @@ def by_utime(path):
     if path.suffix == ".csv":
         rows = zip(csv_block(path, "utime"), csv_block(path, "q", "qd", "tau").tolist(), strict=True)
         return {int(utime[0]): numbers for utime, numbers in rows}
-    messages = [Status.decode(event.data) for event in LcmLogReader(path) if event.channel == "DVRK_STATUS_MTML"]
+    messages = [Status.decode(event.data) for event in read_events(path, []) if event.channel == "DVRK_STATUS_MTML"]
     return {message.utime: list(measurements(message)) for message in messages}
 
 
