@@ -316,14 +316,16 @@ class Recording:
             raise RecordingError(f"{self.source or 'recording'} has no rows")
         q = self.in_joint_coordinates(arm).q
         excess = np.maximum(arm.position_lower - q, q - arm.position_upper) / arm.per_joint(*LIMIT_TOLERANCE)
-        row, joint = np.unravel_index(np.argmax(excess), excess.shape)
-        if excess[row, joint] <= 1:
+        largest, joint = np.unravel_index(np.argmax(excess), excess.shape)
+        if excess[largest, joint] <= 1:
             return
         lower, upper = arm.position_lower[joint], arm.position_upper[joint]
+        rows = np.flatnonzero(excess[:, joint] > 1)
         message = (
-            f"{self.where(int(row))}: {arm.joint_names[joint]} (q{joint + 1}) = {q[row, joint]:.4g} "
-            f"is outside {lower:.4g}..{upper:.4g} {'m' if arm.prismatic[joint] else 'rad'} of {arm.name}."
+            f"{self.where(int(rows[0]))}: {arm.joint_names[joint]} (q{joint + 1}) = {q[rows[0], joint]:.4g} "
+            f"is outside {lower:.4g}..{upper:.4g} {'m' if arm.prismatic[joint] else 'rad'} of {arm.name}"
         )
+        message += "." if len(rows) == 1 else f" (first of {len(rows)} rows, furthest {q[largest, joint]:.4g})."
         outside = np.mean(np.any(excess > 1, axis=1))
         shares = np.max(np.abs(q) / np.maximum(-arm.position_lower, arm.position_upper), axis=0)
         revolute = np.max(shares[~arm.prismatic], initial=0.0)

@@ -15,6 +15,8 @@ from dvrk_drake.reports.plot import Curve, Guide, Panel, effort_unit, joint_labe
 
 #: Number of bins per octave of frequency. The power spectral densities are averaged in each bin.
 _BINS_PER_OCTAVE = 4
+#: Relative difference of the mean rate from the median rate above which both are printed. Clocks and jitter cause less.
+_SAME_RATE = 0.01
 
 
 def check_page(
@@ -51,8 +53,14 @@ def check_page(
         if recording is not None and arm is not None and has_spectra(report):
             signals.append(_spectra(report, recording, arm))
     what = f"{report.rows} rows of {report.kind}"
-    if report.rate is not None and report.duration is not None:
-        what = f"motion of {report.rows} rows, {report.duration:.2f} s at {report.rate:.4g} Hz"
+    if report.longest and report.rate and report.duration:
+        mean = (report.longest - 1) / report.duration
+        what = f"motion of {report.rows} rows, "
+        if report.longest < report.rows:
+            what += f"of which {report.longest} without gaps of the times, "
+        what += f"{report.duration:.2f} s at {report.rate:.4g} Hz"
+        if abs(mean / report.rate - 1) > _SAME_RATE:
+            what += f" (median; {mean:.4g} Hz on average, because rows are missing or times are irregular)"
     verdict, level, next_step = _verdict(report, source, is_model, other_arm)
     return Page(
         f"Check of {report.source}",

@@ -188,7 +188,7 @@ def test_limits_of_an_arm_with_only_prismatic_joints_are_checked():
     lower, upper = np.full(7, -0.1), np.full(7, 0.1)
     arm = replace(psm, prismatic=np.ones(7, bool), position_lower=lower, position_upper=upper)
     with pytest.raises(
-        RecordingError, match=r"yaw \(q1\) = 90 is outside .* m of PSM\. Are the positions in millimetres"
+        RecordingError, match=r"yaw \(q1\) = 90 is outside .* m of PSM .*\. Are the positions in millimetres"
     ):
         Recording(q=np.full((3, 7), 90.0)).check_fits(arm)
 
@@ -213,9 +213,13 @@ def test_prismatic_joint_in_millimetres_is_refused():
     q = arm.sample_poses(20, np.random.default_rng(0))
     Recording(q=q).check_fits(arm)
     q[:, 2] *= 1000
-    with pytest.raises(
-        RecordingError, match=r"insertion \(q3\) = .* 0\.\.0\.24 m of PSM\. Are the positions in millimetres"
-    ):
+    q[:3, 2] = 0.0
+    first, largest = f"{q[3, 2]:.4g}", f"{q[:, 2].max():.4g}"
+    match = (
+        rf"^recording, row 4: insertion \(q3\) = {first} is outside 0\.\.0\.24 m of PSM "
+        rf"\(first of 17 rows, furthest {largest}\)\. Are the positions in millimetres"
+    )
+    with pytest.raises(RecordingError, match=match):
         Recording(q=q).check_fits(arm)
 
 
@@ -250,7 +254,7 @@ def test_recording_of_a_right_arm_does_not_fit_a_left_arm():
     q = np.zeros((3, 7))
     q[:, 3] = 3.4
     Recording(q=q).check_fits(load_arm("mtmr"))
-    with pytest.raises(RecordingError, match=r"wrist_platform \(q4\) = 3\.4 .* of MTML\. Is the arm"):
+    with pytest.raises(RecordingError, match=r"wrist_platform \(q4\) = 3\.4 .* of MTML .*\. Is the arm"):
         Recording(q=q).check_fits(load_arm("mtml"))
 
 

@@ -69,7 +69,7 @@ def check_motion(report: RecordingReport, observations: Observations) -> tuple[R
     duration, rate = float(t[-1] - t[0]), 1 / interval
     findings = [*_times(clock), *_gap_findings(recording)]
     repeated = float(np.mean(repeated_rows(actuators)))
-    report = replace(report, rate=rate, duration=duration, jitter=clock.jitter, repeated=repeated)
+    report = replace(report, longest=len(t), rate=rate, duration=duration, jitter=clock.jitter, repeated=repeated)
     if duration < MIN_DURATION or rate < (1 - MAX_LOST) * MIN_RATE:
         what = (
             f"the motion lasts {duration:.3g} s at {rate:.3g} Hz, so lags, signs, noise and repetition are not checked"

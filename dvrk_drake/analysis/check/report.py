@@ -54,7 +54,7 @@ class JointSignals:
 class RecordingReport:
     """Result of `check` and `check_recording`.
 
-    The attributes from `rate` to `floor_cut_off` are None if they do not apply, for example to poses.
+    The attributes from `longest` to `floor_cut_off` are None if they do not apply, for example to poses.
 
     Attributes:
         source: Source of the recording.
@@ -63,8 +63,10 @@ class RecordingReport:
         rows: Number of rows of the recording.
         joints: Statistics of the joints, in the arm's order.
         findings: Refusals first, then warnings, then notes.
+        longest: Number of rows of the longest segment of a motion without gaps of its times. The statistics of the
+            motion are those of this segment.
         rate: Median sampling rate of a motion [Hz].
-        duration: Duration of a motion [s].
+        duration: Duration of the longest segment [s].
         jitter: Standard deviation of the differences between true and recorded intervals, divided by the mean interval
             [1].
         repeated: Share of rows that repeat the previous row [1].
@@ -78,6 +80,7 @@ class RecordingReport:
     rows: int
     joints: tuple[JointSignals, ...] = ()
     findings: tuple[Finding, ...] = field(default=())
+    longest: int | None = None
     rate: float | None = None
     duration: float | None = None
     jitter: float | None = None
