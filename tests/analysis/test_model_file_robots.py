@@ -104,6 +104,23 @@ def test_gravity_along_another_axis_is_found_and_used(level_base):
     assert finding.kind == "gravity direction" and "(0 9.81 0)" in finding.what
 
 
+def test_zero_that_differs_by_a_half_turn_is_found_within_the_limits(level_base):
+    arm = dvrk.load_arm(level_base)
+    true = robot_motion(arm)
+    found, _ = find_mounting(Observations(dataclasses.replace(true, q=true.q + 2 * QUARTER_TURN), arm))
+    assert found.position_offsets == {"swing": pytest.approx(-np.pi)}
+
+
+@pytest.mark.parametrize(
+    ("gravity", "text"), [([0, 9.81, 0], "do not determine both"), ([0, 0, 9.81], "do not determine how")]
+)
+def test_unknown_gravity_and_zeros_are_reported(level_base, gravity, text):
+    arm = dvrk.load_arm(level_base)
+    true = robot_motion(arm.with_gravity(gravity))
+    *_, finding = find_mounting(Observations(dataclasses.replace(true, q=true.q + QUARTER_TURN), arm))[1]
+    assert finding.kind == "mounting" and text in finding.what and "position_offsets" in finding.advice
+
+
 def test_shifted_zero_is_found_and_stored(level_base, tmp_path):
     arm = dvrk.load_arm(level_base)
     true = robot_motion(arm)

@@ -48,6 +48,11 @@ MAX_SCALE = 4.0
 #: Smallest correlation between measured and nominal gravity efforts for a statement on their ratio. It is above 0.9 for
 #: three robots, and low if the gravity efforts hardly change during the motion.
 MIN_SIMILARITY = 0.8
+#: Advice if a recording does not determine the mounting.
+_STATE_MOUNTING = (
+    "Write an arm file with dvrk-drake arm-file, and state in it what is known: gravity (vector in the base frame "
+    "[m/s^2]) or position_offsets (position in the model minus recorded position of each joint [rad, m])."
+)
 #: Number of combinations of joint zeros to which another change is added.
 _NUM_KEPT = 3
 #: Number of reweighted fits for the direction of gravity, after which it changes by less than 1 degree.
@@ -79,17 +84,36 @@ def find_mounting(observations: Observations) -> tuple[Arm, list[Finding]]:
         return arm, []
     search = _Search(fit)
     gravity, offsets = search.best()
+    # A zero may differ by a half turn in both directions. One of them moves the positions to the middle of the limits.
+    middle = np.mean(own.recording.in_joint_coordinates(arm).q, axis=0) + offsets
+    middle -= (arm.position_lower + arm.position_upper) / 2
+    is_half = np.abs(offsets) > 3 / 4 * np.pi
+    offsets = np.where(is_half, offsets - 2 * np.pi * np.round(middle / (2 * np.pi)), offsets)
     scale = list(_scale_findings(arm, search.scale(gravity, offsets))) if has_converted_model(arm) else []
     found = _arm_with(arm, gravity, offsets)
     if found is arm:
         return arm, scale
-    gain = _log_likelihood(own, found) - fit.log_likelihood
+    gain, is_used = _log_likelihood(own, found) - fit.log_likelihood, is_assumed(arm)
     # Opposite gravity and opposite efforts differ by friction and inertia. `check_channels` reports the latter.
-    if gain < max(MIN_CONFIRMED_GAIN, fit.gain(-np.eye(arm.num_joints)) if fit.moves else 0.0):
-        return arm, scale
-    is_used = is_assumed(arm)
+    opposite = fit.gain(-np.eye(arm.num_joints)) if fit.moves else 0.0
+    if gain < max(MIN_CONFIRMED_GAIN, opposite):
+        what = "the efforts do not determine how the robot is mounted. Gravity and joint zeros of the model are used"
+        unknown = [Finding("warning", "mounting", arm.name, what, _STATE_MOUNTING)]
+        return arm, [*(unknown if is_used and opposite < MIN_CONFIRMED_GAIN else []), *scale]
     used = _arm_with(arm, gravity, np.where(np.abs(offsets) < MIN_USED_OFFSET, 0.0, offsets)) if is_used else arm
-    return used, [*_findings(arm, gravity, offsets, is_used), *scale]
+    findings = [*_findings(arm, gravity, offsets, is_used)]
+    if len({finding.kind for finding in findings}) > 1 and not _is_square(gravity, offsets):
+        what = (
+            "gravity and joint zeros both differ from the model, and the efforts do not determine both: other "
+            "directions of gravity with other zeros have almost the same efforts"
+        )
+        findings.append(Finding("warning", "mounting", arm.name, what, _STATE_MOUNTING))
+    return used, [*findings, *scale]
+
+
+def _is_square(gravity: NDArray[np.float64], offsets: NDArray[np.float64]) -> bool:
+    """Returns whether gravity is along an axis of the base, and all zeros differ by multiples of 90 degrees."""
+    return np.count_nonzero(gravity) == 1 and np.allclose(np.remainder(offsets + 0.1, np.pi / 2), 0.1, atol=1e-6)
 
 
 def _with_wide_limits(arm: Arm) -> Arm:
