@@ -124,9 +124,12 @@ class MessageLink(ArmLink):
         for _ in range(_MESSAGES_AT_ONCE):
             if not self._handle(0.0):
                 break
+        if not self._is_new:
+            return None
+        # Without a new status, the limits of the filter grow, so that statuses after a loss of messages are accepted.
         self._filter.settle(self.now())
-        is_new, self._is_new = self._is_new, False
-        return self._last if is_new else None
+        self._is_new = False
+        return self._last
 
     def next_status(self, seconds: float) -> lcmt_dvrk_status:
         """Returns the newest status of the session that arrives within `seconds`.

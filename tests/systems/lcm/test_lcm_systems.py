@@ -13,6 +13,7 @@ from dvrk_drake.models.lcm_messages import create_key_file
 from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.guard.settings import GuardSettings
 from dvrk_drake.systems.guard.states import State
+from dvrk_drake.systems.lcm.arm_link import DrakeLcmArmLink
 from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.sim_dvrk_driver import DvrkArmServer
 
@@ -269,6 +270,23 @@ def test_outputs_are_nan_without_valid_status():
     later.sequence = 4
     after(later.encode())
     assert station.value("sequence_gaps") == [3.0]
+
+
+def test_polled_link_continues_after_lost_statuses():
+    """As in a station that polls after its Diagram was built for seconds, in which the queue became full."""
+    network, now = DrakeLcm("memq://"), 0.0
+    link = DrakeLcmArmLink(ARM, network)
+    link.now = lambda: now
+    sequences, status = [], full_status()
+    for now in np.arange(0.0, 1.0, 1e-3):
+        status.sequence = round(1e3 * now) + (1000 if now else 0)
+        status.utime = 1 + 1000 * status.sequence
+        network.Publish("DVRK_STATUS_MTML", status.encode())
+        network.HandleSubscriptions(0)
+        if (received := link.poll()) is not None:
+            sequences.append(received.sequence)
+    # The arm sends 1000 statuses per second, and the filter permits 2000 per second and 100 at once.
+    assert sequences == [0, *range(1900, 2000)]
 
 
 def test_ports_tell_the_state_and_a_reset_resumes():
