@@ -11,10 +11,11 @@ import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.geometry import Box, Cylinder, Shape
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.tree import SpatialInertia, UnitInertia
 
@@ -23,7 +24,15 @@ from dvrk_drake.models.arm_schema import COUPLINGS, Frames, Instrument, ViewSett
 from dvrk_drake.models.files import read_json_input
 from dvrk_drake.models.immutable import Shared
 from dvrk_drake.models.ranges import within
-from dvrk_drake.models.sdf_elements import DRAKE, add_element, add_pose, inertial_element, numbers_text
+from dvrk_drake.models.sdf_elements import (
+    DRAKE,
+    add_element,
+    add_pose,
+    inertial_element,
+    numbers_text,
+    read_xml,
+    shape_element,
+)
 from dvrk_drake.models.typed_yaml import load_typed_yaml, typed_content
 
 _TABLE = Path(__file__).with_name("dvrk_tools.yaml")
@@ -36,19 +45,12 @@ _JOINTS = ["roll", "wrist_pitch", "wrist_yaw", "jaw"]
 _TOOL = [[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0]]
 #: Largest rounding error of an angle in the files [rad], e.g. 1.5708 for a quarter turn.
 _ROUNDING = 1e-5
-#: Shaft of the large needle driver [m], its mass [kg], and the masses of a wrist link, a finger and a drive disc. The
-#: first three are those of the large needle driver. The disc of a snake-like wrist is a part of its cables.
-_SHAFT, _SHAFT_MASS, _WRIST_MASS, _FINGER_MASS, _DISC_MASS = 0.4162, 0.0125, 0.0125, 0.0105, 1e-4
-#: Radius of the shaft of the large needle driver, and size of a finger [m].
-_RADIUS, _FINGER = 0.0042, (0.0031, 0.004, 0.012)
-#: Size of the housing of the large needle driver, and its centre relative to the last frame of the arm [m].
-_HOUSING, _HOUSING_CENTER = (0.052, 0.0305, 0.086), np.array([0.0, 0.00725, 0.0032])
-#: Largest effort of a jaw that a file gives no effort, because nothing moves (cautery) [N m]: that of the large needle
-#: driver. Each joint of an arm needs an effort limit, and the fourth disc exists.
-_JAW_EFFORT = 0.16
-#: Inertia [kg m^2] and gear ratio of the motor of a disc, see large_needle_driver.sdf.
-_ROTOR, _GEAR = 1e-6, 11.71
-_VELOCITIES = (2.0, 2.0, 3.0, 3.0)
+#: Model with the masses and sizes that all instruments share, and the name of its instrument in the table.
+_NEEDLE_DRIVER_SDF, _NEEDLE_DRIVER_NAME = _FOLDER.parent / "sdf/large_needle_driver.sdf", "LARGE_NEEDLE_DRIVER_400006"
+#: Mass of the drive disc of a snake-like wrist, which is a part of its cables [kg].
+_DISC_MASS = 1e-4
+#: Gear ratio of the motor of a disc. The model of the needle driver contains its quotients with the disc coupling.
+_GEAR = 11.71
 _QUARTER = np.pi / 2
 #: Pose of the frame that carries an instrument in the base frame, without an arm: z points down along the shaft.
 _DOWN = RigidTransform(RotationMatrix(np.array([[0.0, -1, 0], [-1, 0, 0], [0, 0, -1]])), np.zeros(3))
@@ -95,6 +97,63 @@ class DvrkTools(Shared):
 def dvrk_tools() -> dict[str, DvrkTool]:
     """Returns the instruments of the dVRK by name."""
     return load_typed_yaml(DvrkTools, _TABLE, ArmError, "a table of instruments").tools
+
+
+class _NeedleDriver(NamedTuple):
+    """Facts of the large needle driver.
+
+    Attributes:
+        shaft: Length of the shaft [m].
+        masses: Masses of the shaft, a wrist link and a finger [kg].
+        radius: Radius of the shaft [m].
+        finger: Width, thickness and length of a finger [m].
+        housing: Size of the housing [m].
+        housing_center: Centre of the housing relative to the last frame of the arm [m].
+        velocities: Largest velocities of roll, wrist pitch, wrist yaw and jaw [rad/s].
+        jaw_effort: Largest effort of the jaw [N m].
+        rotor: Inertia of the motor of a disc [kg m^2].
+    """
+
+    shaft: float
+    masses: list[float]
+    radius: float
+    finger: tuple[float, float, float]
+    housing: NDArray[np.float64]
+    housing_center: NDArray[np.float64]
+    velocities: list[float]
+    jaw_effort: float
+    rotor: float
+
+
+@cache
+def _needle_driver() -> _NeedleDriver:
+    model, shaft = read_xml(_NEEDLE_DRIVER_SDF), dvrk_tools()[_NEEDLE_DRIVER_NAME].shaft
+
+    def numbers(path: str) -> NDArray[np.float64]:
+        return np.array((model.findtext(f"model/{path}") or "").split(), dtype=np.float64)
+
+    def number(path: str) -> float:
+        return float(numbers(path)[0])
+
+    blade = "link[@name='finger_1_link']/collision[@name='jaw']"
+    width, thickness, length = numbers(f"{blade}/geometry/box/size")
+    housing = "link[@name='insertion_link']/collision"
+    # The shaft is between the last frame of the arm and the origin of the link of the roll.
+    last = numbers("link[@name='roll_link']/pose")[:3] + np.array([0.0, 0.0, shaft])
+    return _NeedleDriver(
+        shaft=shaft,
+        masses=tuple(
+            number(f"link[@name='{name}_link']/inertial/mass") for name in ("roll", "wrist_pitch", "finger_1")
+        ),
+        radius=number("link[@name='roll_link']/collision/geometry/cylinder/radius"),
+        # A finger begins at its joint, and its blade behind the hub.
+        finger=(width, thickness, round(length / 2 - numbers(f"{blade}/pose")[2], 6)),
+        housing=numbers(f"{housing}/geometry/box/size"),
+        housing_center=np.round(numbers(f"{housing}/pose")[:3] - last, 6),
+        velocities=[number(f"joint[@name='{name}']/axis/limit/velocity") for name in _JOINTS],
+        jaw_effort=number("joint[@name='jaw']/axis/limit/effort"),
+        rotor=number(f"joint[@name='jaw']/{DRAKE}rotor_inertia"),
+    )
 
 
 def read_tool(path: Path) -> DvrkTool:
@@ -201,7 +260,7 @@ def tool_sdf(path: Path, arm: ElementTree.Element | None) -> ElementTree.Element
     Raises:
         ArmError: See `read_tool`; additionally if the arm has no frame dh_3.
     """
-    tool, parent, X = read_tool(path), "insertion_link", _DOWN
+    tool, common, parent, X = read_tool(path), _needle_driver(), "insertion_link", _DOWN
     if arm is not None:
         frame = arm.find("model/frame[@name='dh_3']")
         if frame is None:
@@ -214,12 +273,14 @@ def tool_sdf(path: Path, arm: ElementTree.Element | None) -> ElementTree.Element
     root = ElementTree.Element("sdf", version="1.9")
     writer = _Writer(ElementTree.SubElement(root, "model", name=path.stem.lower().replace("-", "_")))
     writer.housing(parent, X)
-    efforts, limits = [*tool.efforts, tool.jaw[2] or _JAW_EFFORT], [*([-x, x] for x in tool.limits), tool.jaw[:2]]
+    # A file gives the jaw no effort if nothing moves (cautery). Each joint of an arm needs an effort limit, and the
+    # fourth disc exists.
+    efforts, limits = [*tool.efforts, tool.jaw[2] or common.jaw_effort], [*([-x, x] for x in tool.limits), tool.jaw[:2]]
     driven = {
         name: (
             limits[i],
             efforts[i],
-            _VELOCITIES[i],
+            common.velocities[i],
             _GEAR / (abs(tool.coupling[i][i]) or np.abs(tool.coupling[i]).max()),
         )
         for i, name in enumerate(_JOINTS)
@@ -227,13 +288,16 @@ def tool_sdf(path: Path, arm: ElementTree.Element | None) -> ElementTree.Element
     for number, (name, X_before) in enumerate(_chain(tool), 4):
         X = X @ X_before
         X = RigidTransform(_clean(X.rotation()), X.translation())
-        length = tool.shaft if name == "roll" else 2 * _RADIUS + tool.wrist
-        mass = _SHAFT_MASS * tool.shaft / _SHAFT if name == "roll" else _WRIST_MASS
+        shaft_mass, wrist_mass, _ = common.masses
+        length = tool.shaft if name == "roll" else 2 * common.radius + tool.wrist
+        mass = shaft_mass * tool.shaft / common.shaft if name == "roll" else wrist_mass
         if tool.snake and name != "roll":
-            mass = 2 * _WRIST_MASS / 4
+            mass = 2 * wrist_mass / 4
             leader = name[:-2]
             if name.endswith("_1"):  # The position of the joint is the sum of two angles, which this disc shows.
-                writer.add(f"{leader}_disc", X, parent, _DISC_MASS, 2 * _RADIUS, leader, driven[leader], limit_factor=2)
+                writer.add(
+                    f"{leader}_disc", X, parent, _DISC_MASS, 2 * common.radius, leader, driven[leader], limit_factor=2
+                )
             writer.add(name, X, parent, mass, length, name, mimic=(leader, 0.5))
         else:
             writer.add(name, X, parent, mass, length, name, driven[name])
@@ -246,7 +310,7 @@ def tool_sdf(path: Path, arm: ElementTree.Element | None) -> ElementTree.Element
     # snake-like wrist is at the tips.
     fingers = RigidTransform(RotationMatrix.MakeFromOneVector(-X_T.rotation().col(0), 2), X.translation())
     if tool.snake:
-        fingers.set_translation(X_T.translation() - _FINGER[2] * X_T.rotation().col(2))
+        fingers.set_translation(X_T.translation() - common.finger[2] * X_T.rotation().col(2))
     writer.finger("finger_1", fingers, X_T.rotation(), -1.0, parent, "finger_1", mimic=("jaw", -0.5))
     writer.finger("finger_2", fingers, X_T.rotation(), 1.0, "finger_1_link", "jaw", driven=driven["jaw"])
     return root
@@ -256,7 +320,7 @@ class _Writer:
     """Adds links, joints and frames to a model. Links are parallel to the base at the home pose."""
 
     def __init__(self, model: ElementTree.Element) -> None:
-        self._model = model
+        self._model, self._common = model, _needle_driver()
 
     def add(
         self,
@@ -277,28 +341,29 @@ class _Writer:
         """
         height = length if name == "roll" else 0.0
         p_LC = np.array([0.0, 0.0, height / 2])
-        inertia = UnitInertia.SolidCylinder(_RADIUS, length, np.array([0.0, 0.0, 1.0]))
+        inertia = UnitInertia.SolidCylinder(self._common.radius, length, np.array([0.0, 0.0, 1.0]))
         link = self._link(name, X, mass, p_LC, inertia)
         # Short links end before the next one, and the disc of a snake-like wrist is inside the shaft.
-        values = {"radius": _RADIUS, "length": length if name == "roll" else 0.9 * length}
         if not name.endswith("_disc"):
-            self._shapes(link, "cylinder", values, RigidTransform(p_LC))
+            cylinder = Cylinder(self._common.radius, length if name == "roll" else 0.9 * length)
+            self._shapes(link, cylinder, RigidTransform(p_LC))
         self._joint(joint, parent, name, X.rotation().col(2), driven, mimic, limit_factor)
 
     def housing(self, carrier: str, X: RigidTransform) -> None:
         """Adds the housing in front of the last frame of the arm to the link that carries it, which has the mass."""
         link = ElementTree.SubElement(self._model, "link", name=carrier)
-        self._shapes(link, "box", {"size": _HOUSING}, RigidTransform(X.translation() + _HOUSING_CENTER))
+        self._shapes(link, Box(self._common.housing), RigidTransform(X.translation() + self._common.housing_center))
 
     def finger(
         self, name: str, X: RigidTransform, R_tool: RotationMatrix, side: float, parent: str, joint: str, **kind: Any
     ) -> None:
         """Adds a finger, which points along the z axis of the tool frame and lies on one side of it."""
-        p_LC = R_tool @ np.array([0.0, side * _FINGER[0] / 2, _FINGER[2] / 2])
+        width, _, length = size = self._common.finger
+        p_LC = R_tool @ np.array([0.0, side * width / 2, length / 2])
         R = RotationMatrix(np.column_stack([R_tool.col(1), -R_tool.col(0), R_tool.col(2)]))
-        inertia = UnitInertia.SolidBox(*_FINGER).ReExpress(R)
-        link = self._link(name, X, _FINGER_MASS, p_LC, inertia)
-        self._shapes(link, "box", {"size": _FINGER}, RigidTransform(R, p_LC))
+        inertia = UnitInertia.SolidBox(*size).ReExpress(R)
+        link = self._link(name, X, self._common.masses[2], p_LC, inertia)
+        self._shapes(link, Box(*size), RigidTransform(R, p_LC))
         self._joint(joint, parent, name, X.rotation().col(2), kind.get("driven"), kind.get("mimic"), 1.0)
 
     def frame(self, name: str, R: RotationMatrix, link: str, p: NDArray[np.float64] | None = None) -> None:
@@ -315,13 +380,13 @@ class _Writer:
         link.append(inertial_element(central.Shift(-p_LC)))
         return link
 
-    def _shapes(self, link: ElementTree.Element, shape: str, values: dict[str, Any], X: RigidTransform) -> None:
+    def _shapes(self, link: ElementTree.Element, shape: Shape, X: RigidTransform) -> None:
         for tag in ("visual", "collision"):
-            part = ElementTree.SubElement(link, tag, name=f"{self._model.get('name')}_{shape}_{tag}")
+            element = shape_element(shape)
+            assert element is not None
+            part = ElementTree.SubElement(link, tag, name=f"{self._model.get('name')}_{element.tag}_{tag}")
             add_pose(part, X)
-            element = ElementTree.SubElement(ElementTree.SubElement(part, "geometry"), shape)
-            for key, value in values.items():
-                add_element(element, key, numbers_text(value))
+            ElementTree.SubElement(part, "geometry").append(element)
             if tag == "visual":
                 add_element(ElementTree.SubElement(part, "material"), "diffuse", "0.3 0.32 0.35 1")
 
@@ -354,5 +419,5 @@ class _Writer:
             strict=True,
         ):
             add_element(limit, tag, repr(float(value)))
-        add_element(joint, f"{DRAKE}rotor_inertia", repr(_ROTOR))
+        add_element(joint, f"{DRAKE}rotor_inertia", repr(self._common.rotor))
         add_element(joint, f"{DRAKE}gear_ratio", repr(round(float(gear), 4)))
