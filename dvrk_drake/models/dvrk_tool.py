@@ -142,9 +142,7 @@ def _needle_driver() -> _NeedleDriver:
     last = numbers("link[@name='roll_link']/pose")[:3] + np.array([0.0, 0.0, shaft])
     return _NeedleDriver(
         shaft=shaft,
-        masses=tuple(
-            number(f"link[@name='{name}_link']/inertial/mass") for name in ("roll", "wrist_pitch", "finger_1")
-        ),
+        masses=[number(f"link[@name='{name}_link']/inertial/mass") for name in ("roll", "wrist_pitch", "finger_1")],
         radius=number("link[@name='roll_link']/collision/geometry/cylinder/radius"),
         # A finger begins at its joint, and its blade behind the hub.
         finger=(width, thickness, round(length / 2 - numbers(f"{blade}/pose")[2], 6)),
