@@ -8,12 +8,7 @@ from pathlib import Path
 import pytest
 from chromium import chromium_browser, open_page  # noqa: F401
 from identified_poses import identified_poses  # noqa: F401
-from own_network import (  # noqa: F401
-    pytest_runtest_protocol,
-    pytest_sessionfinish,
-    pytest_terminal_summary,
-    pytest_testnodedown,
-)
+from own_network import pytest_runtest_protocol, pytest_sessionfinish, pytest_terminal_summary, pytest_testnodedown  # noqa: F401
 
 # Must be set before numpy is imported. The matrices are small and each core already has a test worker, so additional
 # BLAS threads only wait for each other.

@@ -74,7 +74,7 @@ TESTS = Path(__file__).parent
 MIN_VALUE = 1e-13
 #: Functions that compute with BLAS or numba. Tests must not compare their results exactly.
 COMPUTED = {"column", "effect_effort", "effort", "holding_torque", "mass_matrix", "predict", "predict_motion"} | {
-    *("pull_back_effort", "regressor", "torque"),
+    *("pull_back_effort", "regressor", "torque")
 }
 
 

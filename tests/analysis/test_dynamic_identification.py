@@ -5,7 +5,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from command_output import refusal
+from command_output import assert_refused, refusal
 from motions import fourier_motion, friction_everywhere, recorded, true_dynamics
 from recordings import csv_block
 
@@ -194,12 +194,10 @@ def test_model_file_round_trip(case, tmp_path):
         ("coordinate: actuator.", "coordinate: motor.", "allowed: actuator."),
     ):
         (tmp_path / "bad.yaml").write_text(text.replace(old, new, 1))
-        with pytest.raises(ModelError, match=message):
-            IdentifiedModel.load(tmp_path / "bad.yaml")
+        assert_refused(ModelError, message, IdentifiedModel.load, tmp_path / "bad.yaml")
     heavy = result.model.dynamics.links[0].parameters
     (tmp_path / "bad.yaml").write_text(text.replace(str(heavy[4]), "-1.0", 1))
-    with pytest.raises(ModelError, match="is not physically consistent"):
-        IdentifiedModel.load(tmp_path / "bad.yaml")
+    assert_refused(ModelError, "is not physically consistent", IdentifiedModel.load, tmp_path / "bad.yaml")
 
 
 def test_commands_reject_an_invalid_motion(case, tmp_path, capsys):

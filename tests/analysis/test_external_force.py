@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from command_output import refusal
+from command_output import assert_refused, refusal
 from pushed_arm import pushed_arm
 from report_pages import printed
 
@@ -106,12 +106,10 @@ def test_refusals_are_one_line(pushed, poses):
         (ModelError, r"pushed\.csv: the arm moves, but the model was identified from static poses", poses[:1]),
         (ModelError, "does not state its errors", (IdentifiedModel.from_arm(PSM, dynamics=True),)),
     ):
-        with pytest.raises(error, match=message):
-            estimate_force(recording, *arguments)
+        assert_refused(error, message, estimate_force, recording, *arguments)
     with pytest.raises(ArmError, match=r'no frame "tip"; available frames: .*dh_6'):
         estimate_force(recording, poses[0], frame="tip")
-    with pytest.raises(ModelError, match="the model states no errors"):
-        estimate_force(poses[1], IdentifiedModel.from_arm(PSM))
+    assert_refused(ModelError, "the model states no errors", estimate_force, poses[1], IdentifiedModel.from_arm(PSM))
 
 
 def test_page_states_the_force(estimate, tmp_path):

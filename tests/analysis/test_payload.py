@@ -5,7 +5,7 @@ import json
 
 import numpy as np
 import pytest
-from command_output import messages
+from command_output import assert_refused, messages
 from loaded_arm import two_days
 from pydrake.multibody.tree import MultibodyForces
 from report_pages import printed
@@ -153,9 +153,7 @@ LINKS = ["insertion_link", "bottom_bar_link", "end_link"]
 def test_reports_a_payload_on_another_link():
     name, link, mass, position = CASES["end"]
     model, reference, loaded = two_days(name, link, mass, position, 0)
-    assert_end_link_explains(
-        point_masses(reference, loaded, model, LINKS),
-    )
+    assert_end_link_explains(point_masses(reference, loaded, model, LINKS))
 
 
 def test_without_payload_no_link_is_better():
@@ -236,10 +234,8 @@ def test_model_of_the_loaded_recording_is_refused():
     loaded = dataclasses.replace(loaded, sha256="a" * 64)
     known = IdentifiedModel.from_arm(model.arm)
     known.provenance.sha256 = loaded.sha256
-    with pytest.raises(RecordingError, match="it contains the payload"):
-        estimate(None, loaded, known)
-    with pytest.raises(ModelError, match="a reference recording, or a model"):
-        estimate(None, loaded, model.arm)
+    assert_refused(RecordingError, "it contains the payload", estimate, None, loaded, known)
+    assert_refused(ModelError, "a reference recording, or a model", estimate, None, loaded, model.arm)
 
 
 #: File, link, mass [kg] and height above the remote centre [m], from the README of the recordings. docs/payload.md

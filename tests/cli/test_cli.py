@@ -365,30 +365,6 @@ def test_interrupt_is_not_lost_in_extension_modules(command, tmp_path, monkeypat
     assert code == 130
 
 
-def test_invalid_input_gives_one_line(folder, capsys, tmp_path):
-    poses, model = folder / "poses.csv", folder / "model.yaml"
-    out = tmp_path / "never.yaml"
-    identify = ("identify", poses, "--arm", "mtmr", "--output")
-    assert "its folder does not exist" in fails(capsys, *identify, tmp_path / "no" / "m.yaml")
-    assert "no such file" in fails(capsys, "identify", tmp_path / "x.csv", "--arm", "mtmr", "--output", out)
-    assert "no such file" in fails(capsys, "validate", poses, "--model", tmp_path / "x.yaml")
-    assert "gravity is 0 m/s^2; it must be 1 m/s^2 or more" in fails(capsys, *identify, out, "--gravity", "0", "0", "0")
-
-    bad = tmp_path / "bad.csv"
-    recording = read_recording(poses)
-    write_recording(Recording(q=np.degrees(recording.q), tau=recording.tau), bad)
-    assert "Are the positions in degrees instead of rad" in fails(
-        capsys, "identify", bad, "--arm", "mtmr", "--output", out
-    )
-    write_recording(Recording(q=recording.q + 1.5 * np.eye(7)[5], tau=recording.tau), bad)
-    assert "wrist_yaw (q6)" in fails(capsys, "validate", bad, "--model", model)
-    (tmp_path / "m.yaml").write_text(model.read_text().replace("feedforward_scale", "feedforward_scal"))
-    error = fails(capsys, "validate", poses, "--model", tmp_path / "m.yaml")
-    assert 'm.yaml: joints[0]: key "feedforward_scal" is unknown; did you mean "feedforward_scale"? allowed' in error
-    assert not out.exists()
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["bad.csv", "m.yaml"]
-
-
 def test_rejects_the_same_path_for_two_outputs(folder, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     export = ["export", "--model", f"{folder}/model.yaml", "--sdf", "o.sdf", "--urdf"]

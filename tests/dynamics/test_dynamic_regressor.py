@@ -6,6 +6,7 @@ import re
 
 import numpy as np
 import pytest
+from command_output import assert_refused
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import MultibodyForces
 from pydrake.systems.framework import Context
@@ -134,21 +135,16 @@ def test_writes_to_the_output_array(arm):
     out = np.full((700, arm.num_joints, len(model.names)), np.nan)
     assert model.regressor(*motion, out=out) is out
     np.testing.assert_allclose(out, model.regressor(*motion), rtol=0, atol=1e-12 * np.abs(out).max())
-    with pytest.raises(ModelError, match="C-contiguous"):
-        model.regressor(*motion, out=out[:-1])
-    with pytest.raises(ModelError, match="C-contiguous"):
-        model.regressor(*motion, out=np.asfortranarray(out))
+    assert_refused(ModelError, "C-contiguous", model.regressor, *motion, out=out[:-1])
+    assert_refused(ModelError, "C-contiguous", model.regressor, *motion, out=np.asfortranarray(out))
 
 
 def test_rejects_wrong_shapes(arm):
     model = DynamicRegressor(arm)
     q, v, vd = random_motion(arm, 3)
-    with pytest.raises(ModelError, match="allowed"):
-        model.regressor(q, v[:2], vd)
-    with pytest.raises(ModelError, match="allowed"):
-        model.regressor(q[0], v[0], vd[0])
-    with pytest.raises(ModelError, match="parameters have shape"):
-        model.torque(q, v, vd, model.values[:-1])
+    assert_refused(ModelError, "allowed", model.regressor, q, v[:2], vd)
+    assert_refused(ModelError, "allowed", model.regressor, q[0], v[0], vd[0])
+    assert_refused(ModelError, "parameters have shape", model.torque, q, v, vd, model.values[:-1])
 
 
 # Tests torque, number and names of the base parameters of the full dynamics.

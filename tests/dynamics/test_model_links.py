@@ -7,12 +7,7 @@ import pytest
 
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
-from dvrk_drake.dynamics.dynamic_section import (
-    DynamicSection,
-    LinkEstimate,
-    RotorEstimate,
-    SignalSettings,
-)
+from dvrk_drake.dynamics.dynamic_section import DynamicSection, LinkEstimate, RotorEstimate, SignalSettings
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import parameters_from_pseudo_inertia
 from dvrk_drake.dynamics.model_links import model_bodies

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from command_output import refusal
+from command_output import assert_refused, refusal
 from pydrake.symbolic import Variable
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import LeafSystem
@@ -151,36 +151,20 @@ def test_other_commands_read_the_recording(tmp_path, capsys, monkeypatch):
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        (
-            "durations=2",
-            'psm: key "durations" is unknown; did you mean "duration"? allowed in a scenario: arm, closure',
-        ),
-        ("duration=long", 'psm: duration is "long"; allowed: a number'),
-        ("simulated_effects=all", 'psm: simulated_effects is "all"; allowed: a list of strings, e.g. [all]'),
+        ("durations=2", 'psm: key "durations" is unknown; did you mean "duration"? allowed in a scenario: arm,'),
         ("simulated_effects=[al]", "unknown effect al; allowed: all, friction"),
-        ("targets=3", "targets is 3; allowed: a list of mappings with the keys time, pose"),
-        ("controller.gains.kp=[1, a]", 'controller.gains.kp[1] is "a"; allowed: a number'),
-        ("duration=.nan", "duration is nan; allowed: a finite number"),
-        ("time_step=0.1", "time_step is 0.1; allowed: 1e-05..0.01"),
         ("closure=weld", 'closure is "weld"; allowed: mimic, ball'),
         ("controller.mode=float", 'controller.mode is "float"; allowed: hold, gravity'),
         ("controller.model=nothing.yaml", "nothing.yaml: no such file"),
-        ("gravity=[0, 0, 981]", "gravity[2] is 981; allowed: -30..30 m/s^2"),
         ("start=[0, 0, 0.1, 0, 0, 0]", "start has 6 numbers; PSM has 7 joints: yaw, pitch, insertion"),
         (
             "start=[0, 0, 100, 0, 0, 0, 0]",
             "insertion = 100 is outside 0..0.24 [rad, m] of PSM. Give insertion in m, not in mm.",
         ),
         ("start=[3, 0, 0.1, 0, 0, 0, 0]", "yaw = 3 is outside -1.588..1.588 [rad, m] of PSM"),
-        ("start=[0, .nan, 0.1, 0, 0, 0, 0]", "start[1] is nan; allowed: a finite number"),
         ("targets=[{time: 1, pose: [0, 0]}]", "targets[0].pose has 2 numbers"),
-        (
-            f"targets=[{{time: 9, pose: {ZERO}}}]",
-            "targets[0].time is 9 s; allowed: after 0 s, up to the duration of 5 s",
-        ),
-        (f"targets=[{{time: .nan, pose: {ZERO}}}]", "targets[0].time is nan; allowed: a finite number"),
+        (f"targets=[{{time: 9, pose: {ZERO}}}]", "targets[0].time is 9 s; allowed: after 0 s, up to the duration of"),
         ("effects=[{coordinate: elbow, kind: offset}]", 'effects[0].coordinate is "elbow"; allowed: actuator.yaw'),
-        ("seed=-1", "seed is -1"),
         ("arm=psm9", 'unknown arm "psm9"; did you mean "psm"? known arms: ecm, ecm_si, mtml, mtmr, psm, psm_si'),
         ("duration", "--set duration: a setting must be key=value"),
         ("start=[0,", "--set start=[0,: invalid YAML"),
@@ -191,20 +175,6 @@ def test_invalid_settings_give_one_line_error(setting, message, capsys, tmp_path
     assert main(["simulate", "--arm", "psm", "--set", setting, "--output", str(output)]) == 2
     assert message in refusal(capsys.readouterr().err)
     assert not output.exists()
-
-
-def test_rejects_files_that_are_not_scenarios(tmp_path):
-    path = tmp_path / "scenario.yaml"
-    with pytest.raises(ScenarioError, match="no such file"):
-        load_scenario(str(path))
-    for text, message in (
-        ("[1, 2]", "must have keys and values"),
-        ("arm: [", "invalid YAML"),
-        ("duration: 2", "arm is missing"),
-    ):
-        path.write_text(text)
-        with pytest.raises(ScenarioError, match=message):
-            load_scenario(str(path))
 
 
 def test_simulates_arm_from_file(tmp_path):
@@ -219,8 +189,7 @@ def test_targets_require_mode_hold():
     scenario = Scenario(arm="psm", targets=[Target(1.0, [0, 0, 0.1, 0, 0, 0, 0])])
     scenario.check()
     scenario.controller.mode = "gravity"
-    with pytest.raises(ScenarioError, match=r'targets require controller\.mode "hold"'):
-        scenario.check()
+    assert_refused(ScenarioError, r'targets require controller\.mode "hold"', scenario.check)
 
 
 class Failing(LeafSystem):
@@ -252,5 +221,4 @@ def test_divergence_is_distinguished_from_programming_errors():
         with pytest.raises(SimulationError, match=r"^the simulation failed at 0.3 s: (Singular matrix|overflow)"):
             advance(Simulator(Failing(error)), times)
     for error in (ValueError("operands could not be broadcast"), RuntimeError("dictionary changed size")):
-        with pytest.raises(type(error), match=str(error)):
-            advance(Simulator(Failing(error)), times)
+        assert_refused(type(error), str(error), advance, Simulator(Failing(error)), times)

@@ -4,7 +4,7 @@ import csv
 
 import numpy as np
 import pytest
-from command_output import refusal
+from command_output import assert_refused, refusal
 from pydrake.trajectories import PiecewisePolynomial
 
 from dvrk_drake.cli import main
@@ -64,12 +64,9 @@ def test_recorded_path_respects_limits_and_speed():
     np.testing.assert_allclose(path.value(2.0).ravel(), expected, atol=2e-3)
     with pytest.raises(ScenarioError, match="exceeds the limits of MTML"):
         recorded_path(ARM, Recording(q=middle + (half + 0.2) * np.sin(t)[:, None], t=t, tau=np.zeros_like(q)))
-    with pytest.raises(ScenarioError, match="speed is 0"):
-        recorded_path(ARM, Recording(q=q, t=t, tau=np.zeros_like(q)), speed=0)
-    with pytest.raises(ScenarioError, match="no times"):
-        recorded_path(ARM, Recording(q=q, tau=np.zeros_like(q)))
-    with pytest.raises(ScenarioError, match="has 2 different times"):
-        recorded_path(ARM, Recording(q=q[:2], t=t[:2]))
+    assert_refused(ScenarioError, "speed is 0", recorded_path, ARM, Recording(q=q, t=t, tau=np.zeros_like(q)), speed=0)
+    assert_refused(ScenarioError, "no times", recorded_path, ARM, Recording(q=q, tau=np.zeros_like(q)))
+    assert_refused(ScenarioError, "has 2 different times", recorded_path, ARM, Recording(q=q[:2], t=t[:2]))
     with pytest.raises(ScenarioError, match="parallelogram exceeds the limits of MTML"):
         recorded_path(ARM, Recording(q=q + 0.6 * np.array([0, 1, 1, 0, 0, 0, 0]), t=t))
     moved = Recording(q=q, t=t).in_actuator_coordinates(ARM)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_output import refusal
+from command_output import assert_refused, refusal
 from figure_rules import checked_figures
 
 from dvrk_drake.cli import main
@@ -167,8 +167,7 @@ def test_friction_is_half_the_difference_of_the_directions(tmp_path):
 
 def test_friction_of_a_model_is_that_of_single_joints():
     model = balanced()
-    with pytest.raises(ModelError, match="no dynamics"):
-        dry_friction(model)
+    assert_refused(ModelError, "no dynamics", dry_friction, model)
     model.dynamics = DynamicSection(
         effects=[
             DriveEffect("actuator.outer_yaw", "coulomb", 0.1, 0.05),
@@ -225,8 +224,7 @@ def test_rejects_a_model_that_the_file_cannot_represent():
             model.base_parameters = IdentifiedModel.from_arm(model.arm).base_parameters
         with pytest.raises(ModelError, match=f"cannot represent.*cause: .*{cause}"):
             compensation_from_model(model, CompensationOptions(tolerance=1e-3))
-    with pytest.raises(ModelError, match="is not an MTM"):
-        compensation_from_model(IdentifiedModel.from_arm(load_arm("psm")))
+    assert_refused(ModelError, "is not an MTM", compensation_from_model, IdentifiedModel.from_arm(load_arm("psm")))
     with pytest.raises(ModelError, match="dead_band must be 7 numbers"):
         compensation_from_model(balanced(), CompensationOptions(dead_band=(0.1,)))
     with pytest.raises(ModelError, match=r"fric_comp_ratio_vec\[\d\] is .*; allowed: 0\.\.1"):
@@ -319,10 +317,7 @@ def test_tilted_base_is_rejected_or_approximated(tmp_path, capsys):
         (lambda gc: gc["gc_dynamic_params_pos"].pop(), "gc_dynamic_params_pos must be 40 finite numbers"),
         (lambda gc: gc["db_vel_vec"].__setitem__(0, "x"), "db_vel_vec must be 7 finite numbers"),
         (lambda gc: gc["db_vel_vec"].__setitem__(0, 5.0), "db_vel_vec[0] (5) must be below sat_vec_vec[0]"),
-        (
-            lambda gc: gc["safe_lower_torque_limit"].__setitem__(1, 9.0),
-            "torque_limit[1] (9) must not exceed",
-        ),
+        (lambda gc: gc["safe_lower_torque_limit"].__setitem__(1, 9.0), "torque_limit[1] (9) must not exceed"),
     ],
 )
 def test_invalid_file_is_rejected_in_one_line(change, message, tmp_path, capsys):
@@ -370,8 +365,7 @@ def test_invalid_file_of_version_1_is_refused(version, changes, message, tmp_pat
     path = tmp_path / "gc.json"
     compensation_from_model(balanced()).save(path, "MTML", "test")
     as_version_1(path, version, **changes)
-    with pytest.raises(ModelError, match=message):
-        GravityCompensationFile.load(path)
+    assert_refused(ModelError, message, GravityCompensationFile.load, path)
 
 
 def test_comparison_detects_runaway_clipping_and_wrong_sign(tmp_path, monkeypatch):

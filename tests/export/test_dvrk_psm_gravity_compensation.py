@@ -5,7 +5,7 @@ import os
 
 import numpy as np
 import pytest
-from command_output import refusal
+from command_output import assert_refused, refusal
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from dvrk_drake.cli import main
@@ -106,19 +106,16 @@ def test_rejects_a_model_that_the_file_cannot_represent():
     with pytest.raises(ModelError, match=r"pitch 0\.3 N m \(9\.0 % of the effort limit, allowed: 0\.285 N m"):
         kinematic_compensation(model)
     model.joints[1].feedforward_scale = 0.0
-    with pytest.raises(ModelError, match="feedforward is disabled for pitch"):
-        kinematic_compensation(model)
+    assert_refused(ModelError, "feedforward is disabled for pitch", kinematic_compensation, model)
     heavy = perturbed_psm()
     (net,) = (p for p in heavy.base_parameters if "- m_counterweight" in p.name and p.name.startswith("(m3"))
     net.value = -0.2
-    with pytest.raises(ModelError, match=r"net mass on the insertion joint is -0\.2 kg"):
-        kinematic_compensation(heavy)
+    assert_refused(ModelError, r"net mass on the insertion joint is -0\.2 kg", kinematic_compensation, heavy)
     net.value = -0.01  # Its weight is less than the dry friction.
     light = kinematic_compensation(heavy)
     assert not light.mass[5:].any() and light.loss.causes[2] == "negative net mass on the insertion joint"
     assert light.loss.difference[2] == pytest.approx(0.01 * 9.81, rel=1e-2)
-    with pytest.raises(ModelError, match="is not a PSM"):
-        kinematic_compensation(IdentifiedModel.from_arm(load_arm("mtml")))
+    assert_refused(ModelError, "is not a PSM", kinematic_compensation, IdentifiedModel.from_arm(load_arm("mtml")))
 
 
 def test_insertion_without_feedforward_has_no_torque():

@@ -8,6 +8,7 @@ import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 import pytest
+from command_output import assert_refused
 from pydrake.geometry import Mesh
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, DiscreteContactApproximation, MultibodyPlant
@@ -16,11 +17,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
-from dvrk_drake.dynamics.inertial_parameters import (
-    LinkInertia,
-    link_inertias,
-    parameters_from_pseudo_inertia,
-)
+from dvrk_drake.dynamics.inertial_parameters import LinkInertia, link_inertias, parameters_from_pseudo_inertia
 from dvrk_drake.dynamics.model_links import nearest_links
 from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
 from dvrk_drake.errors import ArmError, ModelError
@@ -164,8 +161,7 @@ def test_rejects_an_sdf_that_urdf_does_not_support(tmp_path):
     arm = load_arm("mtml")
     root = arm_sdf(arm)
     next(root.iter("cylinder")).tag = "ellipsoid"
-    with pytest.raises(ModelError, match="link base_link, collision housing: URDF does not support the shape ell"):
-        to_urdf(root)
+    assert_refused(ModelError, "link base_link, collision housing: URDF does not support the shape ell", to_urdf, root)
 
 
 def test_only_changed_inertias_are_rewritten():
@@ -221,8 +217,7 @@ def test_rejects_invalid_inertias_and_unknown_links(tmp_path):
         (link.parameters * np.r_[-1, np.ones(9)], "not physically consistent"),
         (link.parameters * np.r_[1, np.ones(3), 0.01, np.ones(5)], "not physically consistent"),
     ):
-        with pytest.raises(ModelError, match=message):
-            write_model(arm, [LinkInertia(link.link, parameters)], path, "a test")
+        assert_refused(ModelError, message, write_model, arm, [LinkInertia(link.link, parameters)], path, "a test")
     with pytest.raises(ModelError, match="no moving link tail"):
         write_model(arm, [LinkInertia("tail", link.parameters)], path, "a test")
     with pytest.raises(ModelError, match="rotor inertia -1 must not be negative"):
@@ -331,8 +326,7 @@ def test_gltf_nodes_are_transformed(tmp_path):
     ],
 )
 def test_gltf_that_cannot_be_converted_is_refused(changes, message, tmp_path):
-    with pytest.raises(ArmError, match=message):
-        to_obj(gltf(tmp_path, **changes))
+    assert_refused(ArmError, message, to_obj, gltf(tmp_path, **changes))
 
 
 @pytest.mark.parametrize("origin", ["a---b", "a--b", "-----", "b-"])

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from command_output import assert_refused
 from dvrk_judge import judge
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
@@ -233,8 +234,7 @@ def test_model_stores_its_instrument(tmp_path):
     assert IdentifiedModel.load(path).arm is load_arm("psm", "CADIERE_FORCEPS_400049")
     with pytest.warns(UserWarning, match="instrument CADIERE_FORCEPS_400049, but the arm has large_needle_driver"):
         IdentifiedModel.load(path, load_arm("psm"))
-    with pytest.raises(ModelError, match="is for PSM, not for MTML"):
-        IdentifiedModel.load(path, load_arm("mtml"))
+    assert_refused(ModelError, "is for PSM, not for MTML", IdentifiedModel.load, path, load_arm("mtml"))
 
 
 def test_recording_stores_the_instrument(tmp_path):
@@ -256,8 +256,7 @@ def test_recording_stores_the_instrument(tmp_path):
     ],
 )
 def test_unusable_instruments_are_refused(arm, instrument, message):
-    with pytest.raises(ArmError, match=message):
-        load_arm(arm, instrument)
+    assert_refused(ArmError, message, load_arm, arm, instrument)
 
 
 @pytest.mark.parametrize(
@@ -272,5 +271,4 @@ def test_unusable_files_are_refused(change, message, tools, tmp_path):
     content = read_json_input(tools / "CADIERE_FORCEPS_400049.json", ArmError)
     change(content)
     (tmp_path / "tool.json").write_text(json.dumps(content))
-    with pytest.raises(ArmError, match=message):
-        load_arm("psm", tmp_path / "tool.json")
+    assert_refused(ArmError, message, load_arm, "psm", tmp_path / "tool.json")

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from command_output import refusal
+from command_output import assert_refused, refusal
 from models_in_directives import OTHER_ARM
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
@@ -127,12 +127,9 @@ def test_wrong_directives_are_refused(directives, message, tmp_path, capsys):
 
 
 def test_wrong_arguments_are_refused():
-    with pytest.raises(ExcitationError, match=r"must be the text of a file; Environment\.load"):
-        dvrk.Environment(directives=3)
-    with pytest.raises(ExcitationError, match="environment must be an Environment"):
-        dvrk.MotionLimits(environment=-0.2)
-    with pytest.raises(ExcitationError, match="table is nan"):
-        dvrk.Environment(table=float("nan"))
+    assert_refused(ExcitationError, r"must be the text of a file; Environment\.load", dvrk.Environment, directives=3)
+    assert_refused(ExcitationError, "environment must be an Environment", dvrk.MotionLimits, environment=-0.2)
+    assert_refused(ExcitationError, "table is nan", dvrk.Environment, table=float("nan"))
 
 
 # Within the position limits, no links of an arm collide. The SDF files therefore exclude all pairs of links.

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from arm_copies import copy_arm
+from command_output import assert_refused
 from recordings import HEADER, ROW, random_recording
 
 from dvrk_drake.analysis.excitation.pose_file import CollectionFile, load_poses
@@ -91,8 +92,7 @@ def test_too_large_file_is_refused(name, tmp_path):
     path = tmp_path / name
     with path.open("wb") as stream:
         stream.truncate(MAX_TEXT + 1)
-    with pytest.raises(DvrkDrakeError, match=r"4\.0 MB; allowed: at most 4 MB"):
-        READERS[name](str(path))
+    assert_refused(DvrkDrakeError, r"4\.0 MB; allowed: at most 4 MB", READERS[name], str(path))
 
 
 def test_deeply_nested_files_are_refused_with_their_line(tmp_path):
@@ -101,20 +101,16 @@ def test_deeply_nested_files_are_refused_with_their_line(tmp_path):
             parse_yaml(f"# deep\n{text}", "here", ArmError)
     path = tmp_path / "gc.json"
     path.write_text("[" * 100_000)
-    with pytest.raises(ModelError, match="nested too deeply"):
-        GravityCompensationFile.load(path)
+    assert_refused(ModelError, "nested too deeply", GravityCompensationFile.load, path)
     path = tmp_path / "deep.sdf"
     path.write_text('<sdf><model name="a">' + "<link>" * 100_000)
-    with pytest.raises(ArmError, match="nested deeper than 50 levels"):
-        compose_sdf([str(path)])
+    assert_refused(ArmError, "nested deeper than 50 levels", compose_sdf, [str(path)])
 
 
 def test_aliases_of_aliases_are_refused():
     lines = ["a0: &a0 [1, 1]", *(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]" for k in range(1, 9))]
-    with pytest.raises(ArmError, match="more than 1000000 values"):
-        parse_yaml("\n".join(lines), "here", ArmError)
-    with pytest.raises(ArmError, match="a contains itself"):
-        parse_yaml("a: &a [*a]", "here", ArmError)
+    assert_refused(ArmError, "more than 1000000 values", parse_yaml, "\n".join(lines), "here", ArmError)
+    assert_refused(ArmError, "a contains itself", parse_yaml, "a: &a [*a]", "here", ArmError)
     assert parse_yaml("_t: &t [1, 2]\na: *t\nb: *t", "here", ArmError) == {"a": [1, 2], "b": [1, 2]}
 
 
@@ -145,15 +141,11 @@ def own_arm(folder, change):
             (r'<joint name="\w+" type="revolute">(?:(?!</joint>).)*mimic.*?</joint>', ""),
             r"model\.sdf: no joint connects \w+",
         ),
-        (
-            ("<child>upper_arm_link", "<child>no_link"),
-            r"arm\.yaml: .*model\.sdf: Drake cannot load this model: .*no_link",
-        ),
+        (("<child>upper_arm_link", "<child>no_link"), r"arm\.yaml: .*model\.sdf: Drake cannot load this model:"),
     ],
 )
 def test_sdf_without_a_valid_arm_is_refused(change, message, tmp_path):
-    with pytest.raises(ArmError, match=message):
-        load_arm(own_arm(tmp_path, change))
+    assert_refused(ArmError, message, load_arm, own_arm(tmp_path, change))
 
 
 @pytest.mark.parametrize("key", ["base_parameters[3].value", "joints[2].feedforward_scale", "joints[0].rms_fit"])
@@ -189,8 +181,7 @@ def test_a_model_with_a_missing_key_is_refused(key, tmp_path):
         holder = holder[int(part) if part.isdigit() else part]
     del holder[last]
     path.write_text(yaml.safe_dump(content))
-    with pytest.raises(ModelError, match=re.escape(f"model.yaml: {key} is missing")):
-        IdentifiedModel.load(path)
+    assert_refused(ModelError, re.escape(f"model.yaml: {key} is missing"), IdentifiedModel.load, path)
 
 
 # A large CSV.
@@ -234,8 +225,6 @@ def test_csv_with_too_many_rows_or_too_long_lines_is_refused(tmp_path, monkeypat
     path = tmp_path / "recording.csv"
     path.write_text(f"{HEADER}\n" + f"{ROW}\n" * 4)
     monkeypatch.setattr(csv_rows, "MAX_COUNT", 3)
-    with pytest.raises(RecordingError, match=r", line 5: the file has more than 3 rows\. Split"):
-        read_recording(path)
+    assert_refused(RecordingError, r", line 5: the file has more than 3 rows\. Split", read_recording, path)
     path.write_text(f"{HEADER}\n" + "1" * 3_000_000)
-    with pytest.raises(RecordingError, match="a line has more than 1048576 characters"):
-        read_recording(path)
+    assert_refused(RecordingError, "a line has more than 1048576 characters", read_recording, path)

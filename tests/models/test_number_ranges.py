@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from arm_copies import copy_arm
-from command_output import refusal
+from command_output import assert_refused, refusal
 from schema_faults import schema_fault
 
 from dvrk_drake.analysis.excitation.pose_file import PoseFile
@@ -169,8 +169,7 @@ def test_implausible_gains_are_refused_in_files_and_python(arm, gain, value, tmp
         GravityPidController(IdentifiedModel.from_arm(arm), gains=Gains(**gains))
     path = tmp_path / "gains.yaml"
     path.write_text(yaml.safe_dump(gains))
-    with pytest.raises(ControllerError, match=rf"gains\.yaml: {gain}\[2\] is .*; allowed: "):
-        load_gains(path)
+    assert_refused(ControllerError, rf"gains\.yaml: {gain}\[2\] is .*; allowed: ", load_gains, path)
     assert main(["control", "--arm", arm.source, "--mode", "hold", "--gains", str(path)]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and f"{gain}[2] is " in error
@@ -234,17 +233,10 @@ LIMITS, COUPLED = "position_limits", "coupled_limits"
         ("arm", (LIMITS, "yaw"), [1.0, 1.0], r"position_limits\.yaw is \[1, 1\]; allowed: .* lower < upper"),
         ("arm", (LIMITS, "yaw"), [1.0, 1.001], r"yaw: upper - lower is 0\.001; allowed: 0\.01\.\.25\.2 rad"),
         ("arm", (LIMITS, "insertion"), [0.1, 0.1001], r"insertion: upper - lower is 0\.0001; allowed: 0\.001\.\.30 m"),
-        ("arm", ("gravity",), [0, 0, -9810], r"gravity\[2\] is -9810; allowed: -30\.\.30 m/s\^2"),
-        (
-            "mechanism",
-            (COUPLED,),
-            [{**SUM, "coefficients": {"yaw": 0.0}}],
-            r"coupled_limits\.sum: all coefficients are 0",
-        ),
+        ("mechanism", (COUPLED,), [{**SUM, "coefficients": {"yaw": 0.0}}], r"coupled_limits\.sum: all coefficients"),
         ("mechanism", (COUPLED,), [{**SUM, "coefficients": {"yaw": 1e9}}], r"coefficients\.yaw is 1e\+09; allowed: "),
         ("mechanism", (COUPLED,), [{**SUM, "lower": 1.0}], r"coupled_limits\.sum is \[1, 1\]; allowed: .* < upper"),
         ("mechanism", (COUPLED,), [{**SUM, "lower": 0.999}], r"coupled_limits\.sum: upper - lower is 0\.001; all"),
-        ("mechanism", (COUPLED,), [{**SUM, "upper": 65}], r"coupled_limits\.sum\[1\] is 65; .* is it in degrees\?"),
         (
             "mechanism",
             (COUPLED,),
@@ -259,18 +251,9 @@ LIMITS, COUPLED = "position_limits", "coupled_limits"
         ),
         ("mechanism", ("transmission",), {"yaw": {"yaw": 0.0}}, r"transmission\.yaw: all coefficients are 0"),
         ("mechanism", ("transmission",), {"yaw": {"yaw": 1e9}}, r"transmission\.yaw\.yaw is 1e\+09; allowed: 0 or "),
-        (
-            "instrument",
-            ("joint_from_actuator", "roll"),
-            {"roll": 0.0},
-            r"joint_from_actuator\.roll: all coefficients are 0",
-        ),
+        ("instrument", ("joint_from_actuator", "roll"), {"roll": 0.0}, r"joint_from_actuator\.roll: all coefficients"),
         ("instrument", ("friction_coordinates", "finger_1"), {"jaw": 0.0}, r"friction_coordinates\.finger_1: all c"),
-        ("mechanism", ("effort_cut_off",), 1e6, r"effort_cut_off is 1e\+06; allowed: 0\.1\.\.1000 Hz"),
         ("mechanism", ("motion", "effort_delay"), [5.0, 0, 0], r"effort_delay\[0\] is 5; .*0\.2 s; is it in ms\?"),
-        ("mechanism", ("bounding_shapes", "margin"), 40, r"bounding_shapes\.margin is 40; .* m; is it in mm\?"),
-        ("mechanism", ("effects", "saturation", "yaw"), 1e-9, r"effects\.saturation\.yaw is 1e-09; allowed: "),
-        ("mechanism", ("effects", "encoder", "resolution", "yaw"), 4000, r"resolution\.yaw is 4000; allowed: 1e-09"),
         ("mechanism", ("gains", "kp"), [1e-4, 99.0, 1320.0], r"gains\.kp\[0\] is 0\.0001; .* effort limit of yaw"),
         ("mechanism", ("gains", "kd"), [9.5, 1e5, 79.0], r"gains\.kd\[1\] is 100000; allowed: 0 or .* limit of pitch"),
         ("mechanism", ("gains", "ki"), [9.5, 9.5, 1e8], r"gains\.ki\[2\] is 1e\+08; .* effort limit of insertion"),
@@ -289,13 +272,9 @@ def test_implausible_numbers_in_arm_files_are_refused(file, keys, value, message
     ("element", "value", "message"),
     [
         ("<effort>3[^<]*", "<effort>1e9", r"<effort> is 1e\+09; allowed: -1 or 0 or 0\.001\.\.1e\+06 N m or N"),
-        ("<effort>3[^<]*", "<effort>1e-9", r"<effort> is 1e-09; allowed: "),
         ("<effort>3[^<]*", "<effort>0", r"joint yaw needs a positive effort limit"),
-        ("<effort>3[^<]*", "<effort>-1", r"joint yaw needs a positive effort limit"),
         ("<mass>[^<]*", "<mass>1470.5", r"<mass> is 1470\.5; allowed: 1e-06\.\.200 kg; is it in g\?"),
-        ("<mass>[^<]*", "<mass>1e-9", r"<mass> is 1e-09; allowed: "),
         ("<ixx>[^<]*", "<ixx>26605", r"<ixx> is 26605; allowed: 0\.\.50 kg m\^2"),
-        ("<ixx>[^<]*", "<ixx>-1", r"<ixx> is -1; allowed: "),
         ("<pose>[^<]*", "<pose>0 0 150 0 0 0", r"<pose> is 150; allowed: -5\.\.5 m; is it in mm\?"),
         ("<pose>[^<]*", "<pose>0 0 0 90 0 0", r"<pose> is 90; allowed: -12\.6\.\.12\.6 rad; is it in degrees\?"),
         ("<velocity>[^<]*", "<velocity>180", r"<velocity> is 180; .* rad/s or m/s; is it in degrees/s or mm/s\?"),
@@ -305,8 +284,7 @@ def test_implausible_numbers_in_arm_files_are_refused(file, keys, value, message
 )
 def test_implausible_numbers_in_an_sdf_are_refused(element, value, message, own_psm, capsys):
     path = own_psm(sdf=(element, value))
-    with pytest.raises(ArmError, match=message):
-        load_arm(str(path))
+    assert_refused(ArmError, message, load_arm, str(path))
     assert main(["equations", "--arm", str(path)]) == 2
     assert refusal(capsys.readouterr().err)
 
@@ -336,8 +314,7 @@ def test_implausible_numbers_in_a_model_are_refused(key, value, message, tmp_pat
         owner = owner[int(part) if part.isdigit() else part]
     owner[int(parts[-1]) if parts[-1].isdigit() else parts[-1]] = value
     path.write_text(yaml.safe_dump(content))
-    with pytest.raises(ModelError, match=rf"model\.yaml: {re.escape(key)} is \S+; {message}"):
-        IdentifiedModel.load(path)
+    assert_refused(ModelError, rf"model\.yaml: {re.escape(key)} is \S+; {message}", IdentifiedModel.load, path)
     assert main(["export", "--model", str(path), "--sdf", str(tmp_path / "out.sdf")]) == 2
     assert refusal(capsys.readouterr().err)
 
@@ -354,8 +331,7 @@ def test_invalid_numbers_of_an_arm_made_in_python_are_refused():
         ({"friction_coordinates": {"nothing": np.zeros(7)}}, r"friction_coordinates\.nothing: all coefficients are 0"),
         ({"gravity": np.array([20.0, 20.0, 20.0])}, "must be a vector of three numbers with a norm up to 30"),
     ):
-        with pytest.raises(ArmError, match=message):
-            dataclasses.replace(arm, **changes)
+        assert_refused(ArmError, message, dataclasses.replace, arm, **changes)
 
 
 def test_messages_of_ranges():

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 import pytest
 from arm_copies import copy_arm
+from command_output import assert_refused
 from pydrake.common.yaml import yaml_load_typed
 from schema_faults import schema_fault
 
@@ -18,46 +19,14 @@ pytestmark = pytest.mark.drake_api
 @pytest.mark.parametrize(
     ("file", "change", "message"),
     [
-        (
-            "arm",
-            ("name:", "nam:"),
-            'key "nam" is unknown; did you mean "name"? allowed in an arm file: format, sdf, joints, ',
-        ),
-        ("arm", ("name: PSM", "name: PSM\neffort_limit: abc"), 'key "effort_limit" is unknown; '),
+        ("arm", ("name:", "nam:"), 'key "nam" is unknown; did you mean "name"? allowed in an arm file: format, sdf,'),
         ("arm", ("name: PSM", "name: [PSM]"), "name is ['PSM']; allowed: a string"),
         ("arm", ("name: PSM", "name: PSM\ngravity: 9.81"), "gravity is 9.81; allowed: a list of numbers, e.g. [9.81]"),
         ("arm", ("yaw: [", "yaw: [low, "), 'position_limits.yaw[0] is "low"; allowed: a number'),
-        (
-            "arm",
-            ("name: PSM", "name: PSM\nposition_offsets: []"),
-            "position_offsets is []; allowed: a mapping from names to",
-        ),
-        (
-            "mechanism",
-            ("joints:", "jonts:"),
-            'key "jonts" is unknown; did you mean "joints"? allowed in a mechanism file',
-        ),
-        (
-            "mechanism",
-            ("\n  kp:", "\n  Kp:"),
-            'gains: key "Kp" is unknown; did you mean "kp"? allowed in gains: kp, kd, ki',
-        ),
-        (
-            "mechanism",
-            ("{frame_a:", "{frame_c:"),
-            'loop_closures[0]: key "frame_c" is unknown; allowed in loop_closures: frame_a',
-        ),
-        (
-            "mechanism",
-            ("\n  delay:", "\n  dealy:"),
-            'effects: key "dealy" is unknown; did you mean "delay"? allowed in effects',
-        ),
-        ("instrument", ("joints:", "joint:"), 'instrument.yaml: key "joint" is unknown; did you mean'),
-        (
-            "arm",
-            ("position_limits:", "position_limits: 3\neffort_limits:"),
-            "position_limits is 3; allowed: a mapping from",
-        ),
+        ("mechanism", ("joints:", "jonts:"), 'key "jonts" is unknown; did you mean "joints"? allowed in a mechanism'),
+        ("mechanism", ("\n  kp:", "\n  Kp:"), 'gains: key "Kp" is unknown; did you mean "kp"? allowed in gains: kp,'),
+        ("mechanism", ("{frame_a:", "{frame_c:"), 'loop_closures[0]: key "frame_c" is unknown; allowed in'),
+        ("arm", ("position_limits:", "position_limits: 3\neffort_limits:"), "position_limits is 3; allowed: a"),
         ("instrument", ("sdf:", "sdf: [\n"), "instrument.yaml:"),
     ],
 )
@@ -133,8 +102,7 @@ def test_missing_and_binary_files_are_refused(tmp_path):
         (tmp_path, "is not a file but a folder"),
         (tmp_path / "x", "no such file"),
     ):
-        with pytest.raises(ArmError, match=f"{where}:? {message}"):
-            load_typed_yaml(Outer, where, ArmError, "a test")
+        assert_refused(ArmError, f"{where}:? {message}", load_typed_yaml, Outer, where, ArmError, "a test")
 
 
 @pytest.mark.parametrize("version", ["dvrk_drake arm 2.0", "dvrk_drake model 1.0", 1.0, None, ["dvrk_drake arm 1.0"]])
@@ -145,8 +113,7 @@ def test_arm_of_another_format_is_refused_before_its_keys(version, tmp_path):
     path.write_text("\n".join(line for line in text.splitlines() if not line.startswith("format:")))
     assert load_arm(path).name == "PSM"
     path.write_text(text.replace("format: dvrk_drake arm 1.0", f"format: {version}\nnew_key: 1"))
-    with pytest.raises(ArmError, match=r'arm\.yaml: format is .*; allowed: "dvrk_drake arm 1\.0"$'):
-        load_arm(path)
+    assert_refused(ArmError, r'arm\.yaml: format is .*; allowed: "dvrk_drake arm 1\.0"$', load_arm, path)
 
 
 def test_files_of_this_package_state_their_format():

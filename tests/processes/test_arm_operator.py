@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from command_output import assert_refused
 from guard_bench import ARM
 from guarded_arm import GuardedArm
 from report_pages import printed
@@ -72,8 +73,7 @@ def test_arm_that_does_not_resume_is_an_error():
         link.guard.hold_reason = "its period is 20 ms"
 
     link.before_step = take_over
-    with pytest.raises(ControllerError, match="MTML does not resume: its period is 20 ms"):
-        reset_fault(link, lambda text: None)
+    assert_refused(ControllerError, "MTML does not resume: its period is 20 ms", reset_fault, link, lambda text: None)
 
 
 def fault(link):
@@ -318,5 +318,4 @@ def test_stop_waits_for_confirmation_and_power():
     with pytest.raises(ControllerError, match=r"its power stays on\. Press the emergency stop button"):
         stop_dvrk(observed, power_off=True)
     observed.confirms = False
-    with pytest.raises(ControllerError, match="the arm did not confirm hold"):
-        stop_dvrk(observed)
+    assert_refused(ControllerError, "the arm did not confirm hold", stop_dvrk, observed)

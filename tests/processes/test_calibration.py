@@ -111,11 +111,7 @@ def ran(monkeypatch):
 
 @pytest.mark.parametrize(
     ("like", "joints", "option"),
-    [
-        ("mtmr", {}, "--dvrk-gc"),
-        ("psm", {}, "--dvrk-kinematic-gc"),
-        ("psm", {"joint_names": tuple("abcdefg")}, None),
-    ],
+    [("mtmr", {}, "--dvrk-gc"), ("psm", {}, "--dvrk-kinematic-gc"), ("psm", {"joint_names": tuple("abcdefg")}, None)],
 )
 def test_gravity_file_is_chosen_by_the_joints_of_the_arm(tmp_path, like, joints, option):
     """The names of the arms say nothing: the first arm of dVRK owners may be called anything."""

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from command_output import assert_refused
 from recordings import csv_block
 from sticky_arm import PERIOD, Disk, GuardedArm, make_collector, make_quick, near_poses, random_poses, run_collector
 
@@ -183,8 +184,7 @@ def test_rows_are_written_by_another_thread(tmp_path):
 
 @pytest.mark.parametrize("seconds", [0.5, 61.0])
 def test_rejects_speed_out_of_range(seconds):
-    with pytest.raises(CollectionError, match=r"allowed: 1..60 s"):
-        CollectionSettings(seconds)
+    assert_refused(CollectionError, r"allowed: 1..60 s", CollectionSettings, seconds)
 
 
 def test_trajectory_follows_clock_of_slow_arm(tmp_path):
@@ -341,8 +341,7 @@ def test_unwritable_pose_file_is_an_error(tmp_path):
     (tmp_path / "folder").mkdir()
     hand = Hand(tmp_path / "folder" / "p.yaml")
     (tmp_path / "folder").rmdir()
-    with pytest.raises(DvrkDrakeError, match="cannot be written"):
-        hand.at(near_poses()[0], 0.1, enter=True)
+    assert_refused(DvrkDrakeError, "cannot be written", hand.at, near_poses()[0], 0.1, enter=True)
 
 
 def test_last_pose_is_reported_at_the_end(tmp_path):
@@ -353,8 +352,7 @@ def test_last_pose_is_reported_at_the_end(tmp_path):
         assert one.lines == []
     hand.teacher.close()
     assert hand.lines == ["pose 1 recorded"]
-    with pytest.raises(DvrkDrakeError, match="cannot be written"):
-        broken.teacher.close()
+    assert_refused(DvrkDrakeError, "cannot be written", broken.teacher.close)
 
 
 def test_enter_key_does_not_block():

@@ -235,10 +235,7 @@ def jump(arm):
 @pytest.mark.parametrize(
     ("fault", "message"),
     [
-        (
-            lambda arm: disturb(arm, extra=np.eye(7)[1] * 0.75 * MTML.effort_limits),
-            "of shoulder_pitch differs from the",
-        ),
+        (lambda arm: disturb(arm, extra=np.eye(7)[1] * 0.75 * MTML.effort_limits), "of shoulder_pitch differs from"),
         (lambda arm: disturb(arm, is_blocked=True), "does not follow: "),
         (lambda arm: disturb(arm, is_silent=True), "no message on /MTML/measured_js for 1 s"),
         (lambda arm: disturb(arm, problem="/MTML/measured_js: a position is not finite"), "is not finite"),

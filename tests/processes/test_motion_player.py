@@ -4,6 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
+from command_output import assert_refused
 from sticky_arm import PERIOD, Disk, StickyArm, random_poses, run_collector
 
 from dvrk_drake.analysis.excitation.periodic_motion import FourierBasis, PeriodicMotion
@@ -137,8 +138,7 @@ def test_missing_part_is_recorded_after_a_stop(tmp_path, motion):
     assert np.abs(np.array(second.qd)[0]).max() < 0.02
     assert distance_from_path(motion, second.q).max() < 0.01
     path.unlink()  # a new first part would be joined to the old second part
-    with pytest.raises(CollectionError, match=r"m_2\.csv exists, but .*m\.csv does not"):
-        recorded_parts(path, ARM, motion)
+    assert_refused(CollectionError, r"m_2\.csv exists, but .*m\.csv does not", recorded_parts, path, ARM, motion)
 
 
 def test_short_part_is_recorded_again(tmp_path, motion):
@@ -159,8 +159,7 @@ def test_part_of_another_motion_is_refused(tmp_path, motion):
     header = (tmp_path / "m.csv").read_text()
     cells = ["0"] * (header.count(",") - 1) + [ARM.name, "another motion"]
     (tmp_path / "m.csv").write_text(header + ",".join(cells) + "\n")
-    with pytest.raises(CollectionError, match="is a recording of another motion"):
-        recorded_parts(tmp_path / "m.csv", ARM, motion)
+    assert_refused(CollectionError, "is a recording of another motion", recorded_parts, tmp_path / "m.csv", ARM, motion)
     (tmp_path / "m.csv").write_text("a,b\n1,2\n")
     with pytest.raises(CollectionError, match="is not a motion of MTML recorded by collect"):
         recorded_parts(tmp_path / "m.csv", ARM, motion)

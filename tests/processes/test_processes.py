@@ -10,6 +10,7 @@ from unittest import mock
 import lcm
 import numpy as np
 import pytest
+from command_output import assert_refused
 from forked import run_forked
 from lcm_arm import POSES
 from waiting import TIMEOUT
@@ -134,8 +135,7 @@ def test_realtime_sets_scheduler_and_locks_memory():
 
 @pytest.mark.parametrize("url", ["bogus://", "udpm://nonsense"])
 def test_unusable_network_is_an_error(url):
-    with pytest.raises(DvrkDrakeError, match=f'LCM network "{url}" cannot be used'):
-        open_lcm(url)
+    assert_refused(DvrkDrakeError, f'LCM network "{url}" cannot be used', open_lcm, url)
 
 
 class LossyLcm(lcm.LCM):
@@ -160,11 +160,7 @@ def test_network_without_route_is_an_error():
     code = "from dvrk_drake.systems.lcm.lcm_network import open_lcm; open_lcm()"
     try:
         done = subprocess.run(
-            ["unshare", "-rn", sys.executable, "-c", code],
-            capture_output=True,
-            text=True,
-            timeout=TIMEOUT,
-            check=False,
+            ["unshare", "-rn", sys.executable, "-c", code], capture_output=True, text=True, timeout=TIMEOUT, check=False
         )
     except OSError:
         pytest.skip("no unshare here")
@@ -180,8 +176,7 @@ def test_start_pose_is_inside_limits():
         assert not arm.limit_violations(start_pose(arm), tolerance=-0.01)
     arm = load_arm("mtml")
     np.testing.assert_array_equal(start_pose(arm, [0.1] * 7), [0.1] * 7)
-    with pytest.raises(StationError, match="a pose of MTML is 7 finite numbers"):
-        start_pose(arm, [0.1] * 6)
+    assert_refused(StationError, "a pose of MTML is 7 finite numbers", start_pose, arm, [0.1] * 6)
     with pytest.raises(StationError, match=r"parallelogram = 1.2 is outside"):
         start_pose(arm, [0.0, 0.7, 0.5, 0.0, 0.0, 0.0, 0.0])
 
@@ -193,8 +188,7 @@ def test_driver_file(tmp_path):
     assert (driver.control_modes, driver.guard.expiry, driver.status_period) == (["effort"], 0.03, 1e-3)
     for text in ("control_modes: [speed]", "gard: {}", "guard: {expiry: -1}", "guard: {expiry: soon}", "["):
         path.write_text(text)
-        with pytest.raises(StationError, match=r"driver\.yaml: "):
-            load_driver(path)
+        assert_refused(StationError, r"driver\.yaml: ", load_driver, path)
     for text, message in (
         ("guard: 3", "guard is 3; allowed: a mapping with the keys expiry, "),
         ("gard: {}", 'key "gard" is unknown; did you mean "guard"\\? allowed in .*: .*lcm_url, '),
@@ -208,10 +202,8 @@ def test_driver_file(tmp_path):
         ("control_modes: effort", r"control_modes is \"effort\"; allowed: a list of strings, e\.g\. \[effort\]"),
     ):
         path.write_text(text)
-        with pytest.raises(StationError, match=rf"driver\.yaml: .*{message}"):
-            load_driver(path)
-    with pytest.raises(StationError, match=r"nowhere\.yaml: no such file"):
-        load_driver(tmp_path / "nowhere.yaml")
+        assert_refused(StationError, rf"driver\.yaml: .*{message}", load_driver, path)
+    assert_refused(StationError, r"nowhere\.yaml: no such file", load_driver, tmp_path / "nowhere.yaml")
 
 
 @pytest.mark.parametrize(

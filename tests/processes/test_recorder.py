@@ -98,11 +98,6 @@ def test_bag_has_the_commands_and_the_transforms(tmp_path):
         ]
     # 100 statuses are 0.1 s: five transforms at 50 Hz.
     assert counts.pop("/tf") == 5
-    assert counts == {
-        "/MTML/measured_js": 100,
-        "/MTML/setpoint_js": 100,
-        "/tf_static": 1,
-        "/MTML/robot_description": 1,
-    }
+    assert counts == {"/MTML/measured_js": 100, "/MTML/setpoint_js": 100, "/tf_static": 1, "/MTML/robot_description": 1}
     np.testing.assert_array_equal([one.position for one in commands], [one.position_commanded for one in sent])
     np.testing.assert_array_equal([one.effort for one in commands], [one.effort_commanded for one in sent])

@@ -10,6 +10,7 @@ from unittest.mock import ANY
 import numpy as np
 import pytest
 from arm_processes import dvrk_drake
+from command_output import assert_refused
 from ros_publisher import DOMAIN_FILE, PERIOD, START, rows
 from rosbags.highlevel import AnyReader
 from waiting import TIMEOUT
@@ -219,18 +220,15 @@ def test_missing_jaw_is_noted(record):
     ],
 )
 def test_what_cannot_be_recorded_is_refused(record, tmp_path, messages, options, error):
-    with pytest.raises(RecordingError, match=error):
-        record(messages, **options)
+    assert_refused(RecordingError, error, record, messages, **options)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_wrong_arguments_are_refused(tmp_path, monkeypatch):
-    with pytest.raises(RecordingError, match=r"a\.csv: the file name must end in \.mcap"):
-        RosRecorder(PSM, tmp_path / "a.csv")
+    assert_refused(RecordingError, r"a\.csv: the file name must end in \.mcap", RosRecorder, PSM, tmp_path / "a.csv")
     for domain in ("-1", "233", "x"):
         monkeypatch.setenv("ROS_DOMAIN_ID", domain)
-        with pytest.raises(DvrkDrakeError, match=f"ROS domain {domain}: allowed: 0 to 232"):
-            domain_number()
+        assert_refused(DvrkDrakeError, f"ROS domain {domain}: allowed: 0 to 232", domain_number)
     monkeypatch.setitem(sys.modules, "cyclonedds", None)
     with pytest.raises(DvrkDrakeError, match=r"needs the package cyclonedds: pip install cyclonedds"):
         RosRecorder(PSM, tmp_path / "a.mcap")

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from public_files import NUMBERS, assert_refused, team_array, wpi_rows, write_mat, write_text, write_wpi
+from public_files import assert_refused, team_array, wpi_rows, write_mat, write_wpi
 
-from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import Recording
@@ -60,22 +59,9 @@ def test_the_input_is_not_overwritten(tmp_path):
     assert path.read_bytes() == before
 
 
-def test_failed_conversion_keeps_the_old_output(tmp_path):
-    output = tmp_path / "out.csv"
-    output.write_text("old")
-    assert_refused("the first row has 20 cells", convert, write_text(tmp_path, NUMBERS[:-2]), output)
-    assert output.read_text() == "old"
-    with pytest.raises(DvrkDrakeError, match="cannot be written: No such file or directory"):
-        convert(write_wpi(tmp_path, wpi_rows()), tmp_path / "no" / "out.csv", coordinates="actuator")
-
-
 def test_poses_that_the_arm_cannot_reach_are_refused(tmp_path):
     assert_refused(
-        "is outside",
-        convert,
-        write_mat(tmp_path, saved=100 * team_array()),
-        tmp_path / "out.csv",
-        arm=load_arm("mtml"),
+        "is outside", convert, write_mat(tmp_path, saved=100 * team_array()), tmp_path / "out.csv", arm=load_arm("mtml")
     )
     assert not (tmp_path / "out.csv").exists()
 

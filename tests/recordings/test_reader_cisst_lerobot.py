@@ -48,12 +48,6 @@ def test_reads_joint_states_and_ignores_the_gripper(mtm, tmp_path):
         assert read.notes == (f"signal kin/measured_js of {JOINTS}.csv, in joint coordinates",)
 
 
-def test_orders_joints_by_name(mtm, tmp_path):
-    q, qd, tau = blocks(4, 7)
-    path = write_collection(tmp_path, JOINTS, joint_state("measured_js", mtm.joint_names[::-1], times(4), q, qd, tau))
-    np.testing.assert_array_equal(read_recording(path, mtm).q, q[:, ::-1])
-
-
 def test_io_tables_are_in_actuator_coordinates(mtm, tmp_path):
     q, qd, tau = blocks(4, 7)
     path = write_collection(tmp_path, ACTUATORS, joint_state("measured_js", [], times(4), q, qd, tau))
@@ -81,16 +75,6 @@ def test_omits_invalid_and_repeated_rows(mtm, tmp_path):
     read = read_recording(path, mtm)
     np.testing.assert_array_equal(read.lines, [2, 3, 4, 6, 7, 8])
     assert [note.partition(": ")[2] for note in read.notes[:2]] == ["marked invalid", "same time as another one"]
-
-
-def test_sorts_and_counts_late_rows(mtm, tmp_path):
-    q, qd, tau = blocks(8, 7)
-    order = [0, 1, 4, 3, 2, 5, 7, 6]
-    signal = joint_state("measured_js", mtm.joint_names, times(8)[order], q[order], qd[order], tau[order])
-    read = read_recording(write_collection(tmp_path, JOINTS, signal), mtm)
-    np.testing.assert_array_equal(read.q, q)
-    np.testing.assert_allclose(read.t, 0.005 * np.arange(8), atol=1e-9)
-    assert read.notes[0] == "3 rows of measured_js were not in order, and are sorted by their times"
 
 
 def test_chooses_a_signal(mtm, tmp_path):

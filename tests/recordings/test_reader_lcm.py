@@ -6,15 +6,13 @@ import resource
 import lcm
 import numpy as np
 import pytest
+from command_output import assert_refused
 from mcap.exceptions import EndOfFile
 from mcap.reader import make_reader
 from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
-from recordings import csv_block
 from status_logs import ARM, START, N, log_bytes, statuses
 
-from dvrk_drake.cli import main
-from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm_files import load_arm
@@ -134,17 +132,11 @@ def changed(k, **changes):
     ("messages", "note"),
     [
         (changed(7, arm_name="MTMR"), "messages omitted, of another arm or number of joints: 1"),
-        (
-            [*statuses()[:7], b"garbage", *statuses()[8:]],
-            "messages omitted, not an lcmt_dvrk_status of version 1.0: 1",
-        ),
+        ([*statuses()[:7], b"garbage", *statuses()[8:]], "messages omitted, not an lcmt_dvrk_status of version 1.0: 1"),
         (changed(7, utime=START + 2000), "messages omitted, with the time of another one: 1"),
         (changed(7, utime=START - 95_000), "messages omitted, more than 0.1 s before an earlier one: 1"),
         (changed(7, position=[float("nan")] * N), "messages omitted, with a measurement that is not finite: 1"),
-        (
-            changed(7, guard_state=Status.STATE_OFF),
-            "messages omitted, with the motors off: 1",
-        ),
+        (changed(7, guard_state=Status.STATE_OFF), "messages omitted, with the motors off: 1"),
         ([*statuses()[:7], *statuses()[8:]], "messages lost (gaps in the sequence numbers): 1"),
     ],
 )
@@ -156,14 +148,6 @@ def test_unusable_statuses_are_omitted_and_noted(tmp_path, messages, note):
 
 #: Statuses 5 and 6 arrive after status 7.
 LATE = [*range(5), 7, 6, 5, *range(8, 20)]
-
-
-def test_late_statuses_are_sorted_and_counted(tmp_path):
-    messages = statuses()
-    recording = read_recording(write_log(tmp_path / "a.log", [messages[k] for k in LATE]), ARM)
-    assert_same_numbers(recording, messages)
-    assert recording.notes == ("messages not in order, sorted by their times: 2",)
-    np.testing.assert_array_equal(recording.lines, [LATE.index(k) for k in range(20)])
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".log", ".mcap"])
@@ -210,8 +194,7 @@ def test_arm_is_selected_from_several(tmp_path):
     ],
 )
 def test_log_without_the_arm_lists_its_arms(tmp_path, parts, message):
-    with pytest.raises(RecordingError, match=message):
-        read_recording(write_log(tmp_path / "a.log", *parts), ARM)
+    assert_refused(RecordingError, message, read_recording, write_log(tmp_path / "a.log", *parts), ARM)
 
 
 def test_a_log_is_in_joint_coordinates(tmp_path):
@@ -220,35 +203,6 @@ def test_a_log_is_in_joint_coordinates(tmp_path):
 
 
 # Commands that read a recording.
-
-
-def test_commands_read_logs_like_csv_files(tmp_path, capsys):
-    """Uses a log of static poses with one status per pose, at intervals of 1 s."""
-    truth = IdentifiedModel.from_arm(ARM)
-    messages = statuses(40)
-    for k, status in enumerate(messages):
-        status.utime = START + 1_000_000 * k
-        status.velocity = [0.0] * N
-        status.effort_measured = truth.holding_torque(np.array(status.position)).tolist()
-    log = write_log(tmp_path / "poses.log", messages, b"\xed\xa1\xda\x01half an event")
-    csv = tmp_path / "poses.csv"
-    assert main(["convert", str(log), "--output", str(csv), "--arm", "mtml"]) == 0
-    assert "incomplete message skipped" in capsys.readouterr().out
-    assert_same_numbers(read_recording(csv, ARM), messages)
-    predicted = []
-    for recording in (log, csv):
-        model, output = tmp_path / f"{recording.suffix}.yaml", tmp_path / f"{recording.suffix}.predicted.csv"
-        assert main(["identify", str(recording), "--arm", "mtml", "--output", str(model)]) == 0
-        assert main(["validate", str(recording), "--model", str(model)]) == 0
-        assert main(["predict", str(recording), "--model", str(model), "--output", str(output)]) == 0
-        assert ("note: " in capsys.readouterr().err) == (recording == log)
-        predicted.append(csv_block(output, "tau"))
-    np.testing.assert_allclose(*predicted, atol=1e-12)
-    assert main(["identify", str(log), "--arm", "psm", "--output", str(tmp_path / "x.yaml")]) == 2
-    assert (
-        "no status of PSM (channel DVRK_STATUS_PSM). Channels in the log: DVRK_STATUS_MTML (40)"
-        in capsys.readouterr().err
-    )
 
 
 # Files that are written during a recording.
@@ -276,8 +230,7 @@ def test_unwritable_outputs_are_refused(tmp_path):
         "a.txt": r"must end in \.csv or \.mcap or \.log",
         "no/a.csv": "its folder does not exist",
     }.items():
-        with pytest.raises(RecordingError, match=message):
-            open_recording_file(tmp_path / name, ARM, StatusStream("MTML", N))
+        assert_refused(RecordingError, message, open_recording_file, tmp_path / name, ARM, StatusStream("MTML", N))
 
 
 def messages_in(path, topic=""):

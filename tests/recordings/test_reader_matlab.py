@@ -52,12 +52,7 @@ def test_members_of_structures_have_names_with_dots(tmp_path, kind):
 def gravity_collection(seed, poses=5):
     """Returns the arrays of a file of the gravity collection of JHU and CUHK: joint x pose x sample."""
     position, effort = np.random.default_rng(seed).normal(size=(2, 7, poses, 3))
-    return {
-        "current_position": position,
-        "desired_effort": effort,
-        "joint_trajectory": position[:, :, 0],
-        "Theta": 10,
-    }
+    return {"current_position": position, "desired_effort": effort, "joint_trajectory": position[:, :, 0], "Theta": 10}
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -95,11 +90,7 @@ def test_a_folder_of_the_gravity_collection_is_one_recording(tmp_path):
         ({"A": np.zeros((9, 5))}, {"q": "A"}, "A is 9 x 5; allowed for 7 joints: m x 7"),
         ({"A": np.zeros((9, 7))}, {"tau": "A"}, "no array of 7 joints has a recognised name"),
         ({"A": np.zeros((9, 7)), "B": np.eye(9)}, {"q": "A", "t": "B"}, "B is 9 x 9; allowed for t: a vector"),
-        (
-            {"A": np.zeros((9, 7))},
-            {"position": "A"},
-            "unknown quantity position; allowed: q, qd, tau, t, poses",
-        ),
+        ({"A": np.zeros((9, 7))}, {"position": "A"}, "unknown quantity position; allowed: q, qd, tau, t, poses"),
         ({"A": team_array(), "q": np.zeros((5, 7))}, {"poses": "A", "q": "q"}, "poses contains positions and efforts"),
         ({"name": "text"}, None, "Arrays of real numbers: none"),
         ({"a": np.ones((8, 2, 0))}, None, "no array of 7 joints"),

@@ -8,7 +8,6 @@ import scipy.io
 from public_files import assert_refused, team_array, wpi_rows, write_mat, write_text, write_wpi
 
 from dvrk_drake.analysis.excitation.pose_file import CollectionFile
-from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.reading import detect_format, read_recording
 from dvrk_drake.recordings.recording import Recording
@@ -111,15 +110,6 @@ def test_poses_of_a_collection_have_no_note(tmp_path):
     assert recording.t is None and recording.notes == ()
 
 
-def test_row_of_another_arm_is_rejected(tmp_path):
-    arm, path = load_arm("mtmr"), tmp_path / "poses.csv"
-    names = [f"{block}{i}" for block in ("q", "tau") for i in range(1, 8)]
-    path.write_text(",".join([*names, "arm"]) + "\n" + 2 * (14 * "0," + "MTML\n"))
-    with pytest.raises(RecordingError, match=r"poses\.csv, line 2: the row is of MTML, but the selected arm is MTMR"):
-        read_recording(path, arm)
-    assert len(read_recording(path, load_arm("mtml"))) == len(read_recording(path)) == 2
-
-
 def test_joints_of_files_without_names_can_be_stated(tmp_path):
     arm = load_arm("mtml")
     numbers = dict(zip(arm.joint_names, "2134567", strict=True))
@@ -132,10 +122,7 @@ def test_joints_of_files_without_names_can_be_stated(tmp_path):
         read = read_recording(file, arm, joints=numbers)
         np.testing.assert_array_equal(read.q, q[:, order])
         np.testing.assert_array_equal(read.tau, -q[:, order])
-        for number, match in (
-            ("2", "--joints: 2 is used for two joints of MTML"),
-            ("8", "column q8|no joint 8; it"),
-        ):
+        for number, match in (("2", "--joints: 2 is used for two joints of MTML"), ("8", "column q8|no joint 8; it")):
             assert_refused(match, read_recording, file, arm, joints={"outer_yaw": number})
     named = write_text(tmp_path, "".join(f"q_{name}," for name in arm.joint_names) + "t\n1,2,3,4,5,6,7,0\n")
     names = {name: f"_{name}" for name in arm.joint_names}

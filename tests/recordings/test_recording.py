@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from command_output import assert_refused
 from forked import public_folder, run_unprivileged
 from recordings import HEADER, M_MTM, Q_NAMES, ROW, SIX, TAU_NAMES, random_recording, six_joint_arm, write_text
 
@@ -58,8 +59,7 @@ def test_blank_lines_do_not_shift_line_numbers(tmp_path):
     path = write_text(tmp_path, f"\n{HEADER}\n\n , ,\n{ROW}\n\n{ROW}\n\n")
     np.testing.assert_array_equal(read_recording(path).lines, [5, 7])
     path = write_text(tmp_path, f"\n{HEADER}\n\n{ROW}\n\n{ROW.replace('0.1,', 'x,')}\n")
-    with pytest.raises(RecordingError, match=r"recording\.csv, line 6: q1 is not a number: 'x'"):
-        read_recording(path)
+    assert_refused(RecordingError, r"recording\.csv, line 6: q1 is not a number: 'x'", read_recording, path)
 
 
 def test_missing_efforts_are_reported_when_required(tmp_path):
@@ -69,8 +69,7 @@ def test_missing_efforts_are_reported_when_required(tmp_path):
         RecordingError, match=r"recording\.csv: the recording has no efforts; needs columns tau1\.\.tau7"
     ):
         recording.measured_effort()
-    with pytest.raises(RecordingError, match=r"^the recording has no efforts"):
-        replace(recording, source="").measured_effort()
+    assert_refused(RecordingError, r"^the recording has no efforts", replace(recording, source="").measured_effort)
 
 
 def test_row_without_a_file_is_named_by_its_number():
@@ -104,28 +103,13 @@ ERRORS = {
     "time": (f"t,{HEADER}\nnow,{ROW}\n", r", line 2: t is not a number: 'now'"),
     "too few": (f"{HEADER}\n{ROW}\n{ROW[:-5]}\n", r", line 3: the row has 13 cells, the header has 14"),
     "too many": (f"{HEADER}\n{ROW},\n", r", line 2: the row has 15 cells, the header has 14"),
-    "semicolons": (
-        f"{HEADER}\n{ROW}".replace(",", ";"),
-        r", line 1: the first row has no comma\. Separate cells by commas",
-    ),
+    "semicolons": (f"{HEADER}\n{ROW}".replace(",", ";"), r", line 1: the first row has no comma\. Separate cells by"),
     "tabs": (f"{HEADER}\n{ROW}".replace(",", "\t"), r", line 1: the first row has no comma"),
     "open quote": (f'{HEADER}\n"{ROW}\n{ROW}\n', r", line 3: invalid CSV: unexpected end of data"),
-    "UTF-16": (
-        f"{HEADER}\n{ROW}\n".encode("utf-16-le"),
-        r"recording\.csv: unknown format; allowed: CSV .*ROS bag",
-    ),
-    "cut UTF-16": (
-        f"{HEADER}\n{ROW}\n".encode("utf-16")[:-1],
-        r"recording\.csv is not a UTF-16 text file: truncated data at byte",
-    ),
-    "cut gzip": (
-        gzip.compress(f"{HEADER}\n{ROW}\n".encode())[:-9],
-        r"recording\.csv cannot be read: damaged or incomplete gzip file",
-    ),
-    "gzip of a bag": (
-        gzip.compress(b"\x89MCAP0\r\n\0"),
-        r"recording\.csv: unknown format; allowed: CSV \(also compressed",
-    ),
+    "UTF-16": (f"{HEADER}\n{ROW}\n".encode("utf-16-le"), r"recording\.csv: unknown format; allowed: CSV .*ROS bag"),
+    "cut UTF-16": (f"{HEADER}\n{ROW}\n".encode("utf-16")[:-1], r"recording\.csv is not a UTF-16 text file: truncated"),
+    "cut gzip": (gzip.compress(f"{HEADER}\n{ROW}\n".encode())[:-9], r"recording\.csv cannot be read: damaged or"),
+    "gzip of a bag": (gzip.compress(b"\x89MCAP0\r\n\0"), r"recording\.csv: unknown format; allowed: CSV \(also"),
     "no gzip": (b"\x1f\x8b" + 20 * b"\0", r"recording\.csv cannot be read: damaged or incomplete gzip file"),
     "binary": (bytes(range(1, 256)), r"recording\.csv is not a UTF-8 text file: .* at byte 127"),
 }
@@ -143,8 +127,7 @@ def test_errors_name_file_line_and_column_in_one_line(tmp_path, case):
 def test_recording_with_six_joints(tmp_path):
     path = write_text(tmp_path, f"{SIX}\n" + ",".join(["0"] * 12))
     assert read_recording(path, arm=six_joint_arm()).q.shape == (1, 6)
-    with pytest.raises(RecordingError, match="missing column q7"):
-        read_recording(path)
+    assert_refused(RecordingError, "missing column q7", read_recording, path)
     with pytest.raises(RecordingError, match="unexpected column q7; the arm has 6 joints; joints of PSM: yaw, pitch"):
         read_recording(write_text(tmp_path, f"{HEADER}\n{ROW}"), arm=six_joint_arm())
 
@@ -155,8 +138,7 @@ def test_file_without_read_permission_is_refused():
         path.chmod(0)
 
         def check():
-            with pytest.raises(RecordingError, match=r"cannot be read: Permission denied"):
-                read_recording(path)
+            assert_refused(RecordingError, r"cannot be read: Permission denied", read_recording, path)
 
         run_unprivileged(check)
 
@@ -170,14 +152,12 @@ def test_rows_after_simple_blocks_keep_line_numbers(tmp_path, monkeypatch):
     np.testing.assert_array_equal(recording.lines, [*range(2, 22), *range(23, 34)])
     np.testing.assert_array_equal(recording.q, np.tile(recording.q[0], (31, 1)))
     bad = text + f"{ROW.replace('0.11', '1_1')},3\n"
-    with pytest.raises(RecordingError, match=r"line 34: tau4 is not a number: '1_1'"):
-        read_recording(write_text(tmp_path, bad))
+    assert_refused(RecordingError, r"line 34: tau4 is not a number: '1_1'", read_recording, write_text(tmp_path, bad))
 
 
 def test_an_empty_recording_is_refused_with_one_line():
     empty = Recording(q=np.empty((0, 7)), tau=np.empty((0, 7)))
-    with pytest.raises(RecordingError, match=r"^recording has no rows$"):
-        empty.check_fits(load_arm("mtml"))
+    assert_refused(RecordingError, r"^recording has no rows$", empty.check_fits, load_arm("mtml"))
     assert [finding.what for finding in check_recording(Observations(empty, load_arm("mtml"))).refusals] == [
         "has no rows"
     ]
@@ -202,12 +182,6 @@ def test_poses_inside_the_limits_fit():
     Recording(q=q).check_fits(arm)
 
 
-def test_psm_has_six_joints_and_the_jaw(tmp_path):
-    path = write_text(tmp_path, f"{SIX}\n" + ",".join(["0"] * 12))
-    with pytest.raises(RecordingError, match=r"missing column q7; .*joints of PSM: yaw, pitch, .*, wrist_yaw, jaw"):
-        read_recording(path, load_arm("psm"))
-
-
 def test_prismatic_joint_in_millimetres_is_refused():
     arm = load_arm("psm")
     q = arm.sample_poses(20, np.random.default_rng(0))
@@ -229,8 +203,7 @@ def test_tolerance_of_a_prismatic_joint_is_in_millimetres():
     q[0, 2] = 0.25
     Recording(q=q).check_fits(arm)
     q[0, 2] = 0.27
-    with pytest.raises(RecordingError, match=r"insertion \(q3\) = 0\.27 is outside"):
-        Recording(q=q).check_fits(arm)
+    assert_refused(RecordingError, r"insertion \(q3\) = 0\.27 is outside", Recording(q=q).check_fits, arm)
 
 
 def test_rest_speed_depends_on_the_joint_type():
@@ -246,8 +219,7 @@ def test_one_bad_pose_is_not_reported_as_degrees():
     q[3, 1] = 1.5
     recording = Recording(q=q, source="day.csv", lines=np.arange(2, 12))
     match = r"^day\.csv, line 5: shoulder_pitch \(q2\) = 1\.5 is outside -0\.3142\.\.1\.134 rad of MTMR\. Is the arm"
-    with pytest.raises(RecordingError, match=match):
-        recording.check_fits(load_arm("mtmr"))
+    assert_refused(RecordingError, match, recording.check_fits, load_arm("mtmr"))
 
 
 def test_recording_of_a_right_arm_does_not_fit_a_left_arm():
@@ -290,8 +262,7 @@ def test_coordinates_that_fit_are_named():
 def test_wrong_number_of_joints_is_refused(coordinates):
     recording = Recording(q=np.zeros((2, 6)), source="psm.csv", coordinates=coordinates)
     for function in (recording.check_fits, recording.in_joint_coordinates):
-        with pytest.raises(RecordingError, match=r"psm\.csv has 6 joints, but MTMR has 7"):
-            function(load_arm("mtmr"))
+        assert_refused(RecordingError, r"psm\.csv has 6 joints, but MTMR has 7", function, load_arm("mtmr"))
 
 
 @pytest.mark.parametrize("arm", ["mtml", "mtmr"])
@@ -304,22 +275,6 @@ def test_actuator_coordinates_become_joint_coordinates(arm):
     assert joint.coordinates == "joint"
     assert joint.source == "a.csv"
     np.testing.assert_array_equal(joint.t, actuator.t)
-
-
-def test_actuator_coordinates_of_one_pose():
-    q = np.array([[0.1, 0.2, 0.5, 0.3, -0.1, 0.4, 1.0]])
-    tau = np.array([[1, 2, 3, 4, 5, 6, 7.0]])
-    joint = Recording(q=q, tau=tau, coordinates="actuator").in_joint_coordinates(load_arm("mtmr"))
-    np.testing.assert_allclose(joint.q, [[0.1, 0.2, 0.3, 0.3 - 0.6697 * 0.3, -0.1, 0.4, 1.0]], atol=1e-12)
-    np.testing.assert_allclose(joint.tau, [[1, 2 + 3, 3 + 0.6697 * 4, 4, 5, 6, 7]], atol=1e-12)
-    assert joint.qd is None
-
-
-def test_power_does_not_depend_on_the_coordinates():
-    actuator = random_recording(coordinates="actuator")
-    joint = actuator.in_joint_coordinates(load_arm("mtmr"))
-    power = np.einsum("ij,ij->i", actuator.qd, actuator.tau)
-    np.testing.assert_allclose(np.einsum("ij,ij->i", joint.qd, joint.tau), power, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -346,8 +301,7 @@ def test_a_real_motion_fits_its_arm_only(shared_data):
     assert recording.q.shape == recording.qd.shape == recording.tau.shape == (5999, 7)
     np.testing.assert_allclose(recording.t, np.arange(5999) / 200, atol=1e-9)
     recording.check_fits(load_arm("mtmr"))
-    with pytest.raises(RecordingError, match=r"of MTML .*\. Is the arm"):
-        recording.check_fits(load_arm("mtml"))
+    assert_refused(RecordingError, r"of MTML .*\. Is the arm", recording.check_fits, load_arm("mtml"))
     joint = recording.in_joint_coordinates(load_arm("mtmr"))
     np.testing.assert_allclose(joint.q, recording.q @ M_MTM.T, atol=1e-12)
     power = np.einsum("ij,ij->i", recording.qd, recording.tau)

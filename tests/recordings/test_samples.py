@@ -8,7 +8,7 @@ import re
 
 import numpy as np
 import pytest
-from command_output import refusal
+from command_output import assert_refused, refusal
 from forked import public_folder, run_unprivileged
 from repository import ROOT
 
@@ -86,8 +86,7 @@ def test_motion_is_that_of_the_script(name):
 def test_folder_with_files_is_kept(tmp_path, capsys):
     mine = tmp_path / "mtm_poses.csv"
     mine.write_text("mine")
-    with pytest.raises(dvrk.DvrkDrakeError, match="folder is not empty"):
-        dvrk.write_samples(tmp_path)
+    assert_refused(dvrk.DvrkDrakeError, "folder is not empty", dvrk.write_samples, tmp_path)
     assert mine.read_text() == "mine" and len(list(tmp_path.iterdir())) == 1
     assert main(["samples", str(tmp_path), "--overwrite"]) == 0
     assert {path.name for path in tmp_path.iterdir()} == FILES and mine.read_text() != "mine"
@@ -124,8 +123,7 @@ def test_failed_write_leaves_no_files(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("dvrk_drake.recordings.samples.write_recording", full)
-    with pytest.raises(dvrk.DvrkDrakeError, match="No space left on device"):
-        dvrk.write_samples(tmp_path)
+    assert_refused(dvrk.DvrkDrakeError, "No space left on device", dvrk.write_samples, tmp_path)
     assert not list(tmp_path.iterdir())
 
 

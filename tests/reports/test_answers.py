@@ -21,13 +21,7 @@ from dvrk_drake.experiments.demo.demo import DemoResult
 from dvrk_drake.experiments.demo.teleoperation import TeleoperationResult
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
-from dvrk_drake.reports import (
-    demo,
-    export,
-    recording_check,
-    simulation,
-    terminal,
-)
+from dvrk_drake.reports import demo, export, recording_check, simulation, terminal
 from dvrk_drake.reports.identification import identification_page, recalibration_page
 from dvrk_drake.reports.model import symbolic_model_page
 from dvrk_drake.reports.payload import payload_page
@@ -148,10 +142,7 @@ CASES = {
         lambda c, v: print_page(c, recalibration_page(dvrk.recalibrate(motions()[2].model, motions()[1])), verbose=v),
     ),
     "check": (r"Verdict: usable", checked),
-    "check, refused": (
-        r"Verdict: unusable \(wrong time\)\.",
-        lambda c, v: checked(c, v, t=1000 * motions()[0].t),
-    ),
+    "check, refused": (r"Verdict: unusable \(wrong time\)\.", lambda c, v: checked(c, v, t=1000 * motions()[0].t)),
     "payload": (
         r"Payload: 0\.\d{4} \+- 0\.\d{4} kg on \w+\.",
         lambda c, v: print_page(c, payload_page(payloads()), verbose=v),

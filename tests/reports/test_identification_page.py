@@ -14,14 +14,7 @@ from dvrk_drake.analysis.validation import baseline_efforts
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.models.effects_schema import half_width
-from dvrk_drake.reports.efforts import (
-    MAX_ROWS,
-    bin_means,
-    budget_of,
-    budget_plot,
-    efforts_of,
-    efforts_plot,
-)
+from dvrk_drake.reports.efforts import MAX_ROWS, bin_means, budget_of, budget_plot, efforts_of, efforts_plot
 from dvrk_drake.reports.identification import identification_page
 from dvrk_drake.reports.image_files import write_images
 from dvrk_drake.reports.page import Plot, Scene, Table

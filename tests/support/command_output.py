@@ -1,6 +1,8 @@
-"""Selects messages in the output of a command on stderr."""
+"""Messages of one line: on stderr of a command, and of an error."""
 
 import re
+
+import pytest
 
 #: Line of progress if stderr is not a terminal, e.g. "1 of 3: reading", or "simulating" for a single step.
 STEP = re.compile(r"\d+ of \d+: .+|[a-z][^:]*")
@@ -16,3 +18,10 @@ def refusal(errors):
     (line,) = messages(errors)
     assert line.startswith("dvrk-drake: error: "), line
     return line
+
+
+def assert_refused(error, message, call, *arguments, **options):
+    """Asserts that a call raises an error of this type, whose message has one line and contains a pattern."""
+    with pytest.raises(error, match=message) as caught:
+        call(*arguments, **options)
+    assert "\n" not in str(caught.value), str(caught.value)

@@ -6,12 +6,7 @@ import numpy as np
 
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
-from dvrk_drake.dynamics.dynamic_section import (
-    DynamicSection,
-    LinkEstimate,
-    RotorEstimate,
-    SignalSettings,
-)
+from dvrk_drake.dynamics.dynamic_section import DynamicSection, LinkEstimate, RotorEstimate, SignalSettings
 from dvrk_drake.dynamics.inertial_parameters import parameters_from_pseudo_inertia, rotor_links
 from dvrk_drake.dynamics.physical_consistency import LinkScale, bounding_boxes, reached_bounds
 from dvrk_drake.models.arm import Arm

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from command_output import assert_refused
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from scipy.optimize import linprog
@@ -204,28 +205,24 @@ def test_sum_is_clamped_to_effort_limits():
     ],
 )
 def test_invalid_numbers_are_refused(options, what):
-    with pytest.raises(ControllerError, match=what):
-        FrictionCompensator(FRICTION, **{"holding_error": NO_EFFORT, **options})
+    assert_refused(ControllerError, what, FrictionCompensator, FRICTION, **{"holding_error": NO_EFFORT, **options})
 
 
 def test_compensation_needs_an_error_bound_of_gravity():
-    with pytest.raises(ControllerError, match="a friction ratio above 0 requires holding_error"):
-        FrictionCompensator(FRICTION)
+    assert_refused(ControllerError, "a friction ratio above 0 requires holding_error", FrictionCompensator, FRICTION)
     FrictionCompensator(FRICTION, ratio=0.0, hysteresis_ratio=0.5)
     model = IdentifiedModel.from_arm(ARM, dynamics=True)
     with pytest.raises(ControllerError, match="this model has no error bound at rest, so the arm could creep"):
         holding_error(model)
     for joint in model.joints[1:]:
         joint.rms_leave_one_out_included = 0.1
-    with pytest.raises(ControllerError, match=f"no error bound at rest for {ARM.joint_names[0]}, so"):
-        holding_error(model)
+    assert_refused(ControllerError, f"no error bound at rest for {ARM.joint_names[0]}, so", holding_error, model)
     model.joints[0].rms_leave_one_out_included = 0.1
     np.testing.assert_allclose(holding_error(model), np.full(7, 0.2), rtol=0, atol=1e-12)
 
 
 def test_active_friction_is_refused():
-    with pytest.raises(ControllerError, match=r"allowed for kind .*: 0 or more"):
-        Friction.of(ARM, EFFECTS, -COEFFICIENTS)
+    assert_refused(ControllerError, r"allowed for kind .*: 0 or more", Friction.of, ARM, EFFECTS, -COEFFICIENTS)
     with pytest.raises(ControllerError, match=r"allowed: actuator\.outer_yaw"):
         Friction.of(ARM, [ActuatorEffect("actuator.nose", "viscous")], [1.0])
 

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from command_output import assert_refused
 from controlled_arm import ControlledArm
 from pydrake.systems.analysis import Simulator
 
@@ -218,15 +219,11 @@ def test_feedforward_scale_scales_gravity():
         ({"effort_limits": [1.0] * 6}, "effort_limits must be 7 positive numbers"),
         ({"effort_limits": [np.nan] * 7}, "effort_limits must be 7 positive numbers"),
         ({"gains": Gains(kp=[1.0], kd=[1.0] * 7, ki=[1.0] * 7)}, r"gains\.kp has 1 number; allowed: 7, one per joint"),
-        (
-            {"gains": Gains(kp=[1.0] * 7, kd=[-1.0] * 7, ki=[1.0] * 7)},
-            r"gains\.kd\[0\] is -1; allowed: 0 or ",
-        ),
+        ({"gains": Gains(kp=[1.0] * 7, kd=[-1.0] * 7, ki=[1.0] * 7)}, r"gains\.kd\[0\] is -1; allowed: 0 or "),
     ],
 )
 def test_errors_state_allowed_values(arguments, message):
-    with pytest.raises(ControllerError, match=message):
-        GravityPidController(MODEL, **arguments)
+    assert_refused(ControllerError, message, GravityPidController, MODEL, **arguments)
 
 
 def test_model_of_another_arm_is_refused():
@@ -236,8 +233,7 @@ def test_model_of_another_arm_is_refused():
 
 def test_unconnected_state_is_reported():
     controller = GravityPidController(MODEL)
-    with pytest.raises(ControllerError, match="input port state_estimated is not connected"):
-        Simulator(controller).Initialize()
+    assert_refused(ControllerError, "input port state_estimated is not connected", Simulator(controller).Initialize)
 
 
 # Ramp from the measured to the desired effort.
@@ -280,8 +276,7 @@ def test_a_forced_update_is_one_period():
 
 
 def test_invalid_ramp_is_refused():
-    with pytest.raises(ControllerError, match="must be positive"):
-        EffortRamp(7, duration=0.0)
+    assert_refused(ControllerError, "must be positive", EffortRamp, 7, duration=0.0)
 
 
 # Arms in other mountings: gravity has another direction in the base frame.

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from command_output import assert_refused
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.analysis import Simulator
@@ -272,21 +273,16 @@ def test_scale_changes_without_a_jump():
 
 @pytest.mark.parametrize("scale", [0.0, -0.3, 1.1, np.nan])
 def test_scale_out_of_range_is_refused(scale):
-    with pytest.raises(ControllerError, match="scale must be above 0 and at most 1"):
-        Teleoperation(MTM, PSM, scale=scale)
+    assert_refused(ControllerError, "scale must be above 0 and at most 1", Teleoperation, MTM, PSM, scale=scale)
     loop = Loop()
-    with pytest.raises(ControllerError, match="scale must be above 0 and at most 1"):
-        loop.system.SetScale(loop.context, scale)
+    assert_refused(ControllerError, "scale must be above 0 and at most 1", loop.system.SetScale, loop.context, scale)
 
 
 def test_other_invalid_arguments_are_refused():
-    with pytest.raises(ControllerError, match="period must be a positive number"):
-        Teleoperation(MTM, PSM, period=0.0)
-    with pytest.raises(ControllerError, match="MTML: a joint has no velocity limit"):
-        Teleoperation(MTM, MTM)
+    assert_refused(ControllerError, "period must be a positive number", Teleoperation, MTM, PSM, period=0.0)
+    assert_refused(ControllerError, "MTML: a joint has no velocity limit", Teleoperation, MTM, MTM)
     system = Teleoperation(MTM, PSM)
-    with pytest.raises(ControllerError, match="input port master_position is not connected"):
-        Simulator(system).Initialize()
+    assert_refused(ControllerError, "input port master_position is not connected", Simulator(system).Initialize)
 
 
 # Simulated teleoperation of a PSM by a master.

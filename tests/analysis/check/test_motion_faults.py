@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from command_output import assert_refused
 
 from dvrk_drake.analysis.check.channel_fit import ChannelFit
 from dvrk_drake.analysis.check.recording_check import check_recording, with_power
@@ -50,8 +51,7 @@ def test_names_the_unit_of_wrong_times(unit, factor, rate):
     assert fault.kind == "wrong time" and f"t may be in {unit}: {rate:g} Hz" in fault.what
     assert [f.kind for f in check_recording(Observations(other, ARM)).refusals] == ["wrong time"]
     for call in (lambda: identify(other, ARM), lambda: predict(IdentifiedModel.from_arm(ARM), other)):
-        with pytest.raises(RecordingError, match=f"t may be in {unit}"):
-            call()
+        assert_refused(RecordingError, f"t may be in {unit}", call)
 
 
 def test_finds_the_unit_of_times_of_one_moving_joint():
@@ -120,8 +120,7 @@ def test_two_publishers_on_one_topic_are_named(signal, order):
     mixed = replace(whole, **{name: np.where(second, other, getattr(whole, name))})
     (refusal,) = check_recording(Observations(mixed, ARM)).refusals
     assert refusal.kind == "two sources" and refusal.where == name and "two publishers on one topic" in refusal.advice
-    with pytest.raises(RecordingError, match="two publishers"):
-        identify(mixed, ARM)
+    assert_refused(RecordingError, "two publishers", identify, mixed, ARM)
 
 
 def test_noise_and_quantisation_are_not_two_publishers():
@@ -165,10 +164,7 @@ def test_jumps_between_joined_recordings_are_named(rate):
     ) and f"by {step:.2g} rad at motion.csv, line 602" in refusal.what
     assert "Write joined recordings to one file each; identify accepts several files." in refusal.advice
     for call in (lambda: identify(recording, ARM), lambda: predict(IdentifiedModel.from_arm(ARM), recording)):
-        with pytest.raises(
-            RecordingError, match=r"jumps by .* at motion\.csv, line 602\. Usual causes: recordings joined"
-        ):
-            call()
+        assert_refused(RecordingError, r"jumps by .* at motion\.csv, line 602\. Usual causes: recordings joined", call)
     # The motion during a gap is unknown.
     gap = replace(recording, t=recording.t + np.where(np.arange(1500) < 600, 0.0, 0.3 + 6 / rate))
     assert jump_fault(gap, ARM) is None

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from command_output import refusal
+from command_output import assert_refused, refusal
 from figure_rules import checked_figures
 from synthetic_motion import PERIOD, RATE, clean_motion
 
@@ -260,15 +260,13 @@ def test_the_cause_of_efforts_above_the_limits_is_named(change, advice):
     arm = load_arm("mtmr")
     rows = Recording(q=np.zeros((3, 7)), tau=np.tile(0.9 * arm.effort_limits, (3, 1)))
     check_effort_unit(rows, arm)
-    with pytest.raises(RecordingError, match=advice):
-        check_effort_unit(replace(rows, tau=change(rows.tau)), arm)
+    assert_refused(RecordingError, advice, check_effort_unit, replace(rows, tau=change(rows.tau)), arm)
 
 
 def test_exchanged_positions_and_efforts_are_named():
     arm = load_arm("psm")
     rows = Recording(q=np.tile(0.9 * arm.effort_limits, (3, 1)), tau=np.tile(arm.position_upper, (3, 1)))
-    with pytest.raises(RecordingError, match="if the positions and the efforts are exchanged"):
-        rows.check_fits(arm)
+    assert_refused(RecordingError, "if the positions and the efforts are exchanged", rows.check_fits, arm)
 
 
 def test_refuses_positions_in_degrees():

@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+from command_output import assert_refused
 from sticky_arm import random_poses
 
 from dvrk_drake.analysis.excitation.pose_file import CollectionFile, load_poses, save_poses
@@ -53,8 +54,7 @@ GOOD = "0.1, 0.4, -0.25, 0.6, 0.9, 0.1, 0.5"
 def test_invalid_pose_files_are_refused_in_one_line(text, message, tmp_path, capsys):
     path, output = tmp_path / "p.yaml", tmp_path / "o.csv"
     path.write_text(text)
-    with pytest.raises(CollectionError, match=message):
-        load_poses(path, load_arm("mtml"))
+    assert_refused(CollectionError, message, load_poses, path, load_arm("mtml"))
     # The commands refuse the file before they connect to an arm.
     for task in (["poses", str(path), "--output", str(output)], ["teach", str(path)]):
         assert main(["collect", *task, "--arm", "mtml"]) == 2
@@ -67,8 +67,7 @@ def test_invalid_pose_files_are_refused_in_one_line(text, message, tmp_path, cap
 
 def test_poses_in_millimetres_are_refused(tmp_path):
     (tmp_path / "p.yaml").write_text("arm: PSM\nposes:\n- [0.1, 0.1, 120.0, 0, 0, 0, 0.2]")
-    with pytest.raises(CollectionError, match=r"pose 1: .*millimetres"):
-        load_poses(tmp_path / "p.yaml", load_arm("psm"))
+    assert_refused(CollectionError, r"pose 1: .*millimetres", load_poses, tmp_path / "p.yaml", load_arm("psm"))
 
 
 # Tests that a collection file always has complete rows and can be continued after an interruption.
@@ -141,15 +140,13 @@ def test_other_existing_output_is_refused_and_unchanged(tmp_path):
         CollectionFile(path, arm, True).finished(poses[1:])
     with pytest.raises(CollectionError, match=r"o.csv, line 2: the row is of MTML, not of MTMR"):
         CollectionFile(path, load_arm("mtmr"), True)
-    with pytest.raises(CollectionError, match=r"was collected from both sides \(--both-sides\)"):
-        CollectionFile(path, arm, False)
+    assert_refused(CollectionError, r"was collected from both sides \(--both-sides\)", CollectionFile, path, arm, False)
     lines = path.read_text().splitlines()
     path.write_text("\n".join([*lines, lines[-1] + ",1"]) + "\n")
     with pytest.raises(RecordingError, match=r"o.csv, line 5: the row has 32 cells, the header has 31"):
         CollectionFile(path, arm, True)
     path.write_text("q1,tau1\n1,2\n")
-    with pytest.raises(CollectionError, match="already exists and is not a collection of MTML"):
-        CollectionFile(path, arm, True)
+    assert_refused(CollectionError, "already exists and is not a collection of MTML", CollectionFile, path, arm, True)
     path.write_bytes(before)
 
 

@@ -10,13 +10,7 @@ import dvrk_drake as dvrk
 from dvrk_drake.analysis.excitation import static_poses
 from dvrk_drake.analysis.excitation.motion_limits import CollisionDetector, MotionLimits, first_collision, tip_positions
 from dvrk_drake.analysis.excitation.pose_file import load_poses
-from dvrk_drake.analysis.excitation.static_poses import (
-    MARGIN,
-    MIN_APPROACH,
-    PoseChecker,
-    PoseInformation,
-    _ordered,
-)
+from dvrk_drake.analysis.excitation.static_poses import MARGIN, MIN_APPROACH, PoseChecker, PoseInformation, _ordered
 from dvrk_drake.cli import main
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.approach import approach_offset, offset_pose
@@ -167,11 +161,7 @@ def test_isolated_poses_are_excluded(isolated):
     [
         (7, None, "the number of poses is 7; allowed: 8 to 300"),
         (301, None, "the number of poses is 301"),
-        (
-            10,
-            MotionLimits(environment=Environment(0.0)),
-            "only 0 of 4050 random poses meet all limits, but 10 poses are required",
-        ),
+        (10, MotionLimits(environment=Environment(0.0)), "only 0 of 4050 random poses meet all limits, but 10 poses"),
         (10, MotionLimits(positions={"roll": (0.0, 0.1)}), "position limit at the start of an approach"),
         (10, MotionLimits(positions={"rol": (0.0, 0.1)}), 'unknown joint "rol"'),
     ],
@@ -197,10 +187,7 @@ def test_command_writes_a_pose_file(tmp_path, monkeypatch, capsys):
         (["--output", "p.yaml"], "p.yaml already exists"),
         (["--output", "n.yaml", "--csv", "n.csv"], "--csv cannot be used with --static"),
         (["--output", "n.yaml", "--rate", "200"], "--rate cannot be used with --static"),
-        (
-            ["--output", "n.yaml", "--period", "15", "--starts", "4"],
-            "--period and --starts cannot be used with --static",
-        ),
+        (["--output", "n.yaml", "--period", "15", "--starts", "4"], "--period and --starts cannot be used with"),
         (["--output", "n.yaml", "--duration", "30", "--harmonics", "3"], "--duration and --harmonics cannot be used"),
         (["--output", "n.yaml", "--traverse-time", "2"], "--traverse-time cannot be used with --static"),
         (["--output", "n.yaml", "--margin", "0.5"], "margin is 0.5; allowed: 0..0.4"),

@@ -38,41 +38,22 @@ def study_refusal(capsys, path, *options):
     ("change", "message"),
     [
         (("scenario: psm", "scenario: psm9"), 'unknown arm "psm9"; did you mean "psm"? known arms: ecm, ecm_si, mtml,'),
-        (("scenario: psm", "scenario: nothing.yaml"), "nothing.yaml: no such file"),
         (("scenario: psm", "seeds: [1]"), "scenario is missing"),
         (("scenario: psm", "scenario: psm\nposes: [[0, 0, 0.1, 0, 0, 0]]"), "poses[0] has 6 numbers; PSM has 7 joints"),
         (("scenario: psm", "scenario: psm\nposes: [[9, 0, 0.1, 0, 0, 0, 0]]"), "poses[0]: yaw = 9 is outside"),
-        (
-            ("scenario: psm", "scenario: psm\nposes: [[0, 0, 0.1, 0, 0, 0, 0]]"),
-            "poses and random_poses exclude each other",
-        ),
-        (
-            ("scenario: psm", "scenarios: psm"),
-            'key "scenarios" is unknown; did you mean "scenario"? allowed in a study: scenario, set, poses',
-        ),
+        (("scenario: psm", "scenario: psm\nposes: [[0, 0, 0.1, 0, 0, 0, 0]]"), "poses and random_poses exclude each"),
+        (("scenario: psm", "scenarios: psm"), 'key "scenarios" is unknown; did you mean "scenario"? allowed in a'),
         (("scenario: psm", "scenario: psm\nseeds: [1, 1]"), "seeds must not contain a number twice; got [1, 1]"),
-        (("scenario: psm", "scenario: psm\nseeds: [-1]"), "seeds[0] is -1; allowed: 0..9223372036854775807"),
         (("scenario: psm", "scenario: psm\nseeds: []"), "seeds, variations and measures must not be empty"),
-        (
-            ("scenario: psm", "scenario: psm\nvariations: [{name: a}, {name: a}]"),
-            "variations must have different names",
-        ),
+        (("scenario: psm", "scenario: psm\nvariations: [{name: a}, {name: a}]"), "variations must have different"),
         (("scenario: psm", "scenario: psm\nvariations: [{name: a}, {name: b, set: [arm=mtml]}]"), "the same joints"),
         (("scenario: psm", "scenario: psm\nvariations: [{name: a, set: [length=2]}]"), "length"),
-        (("duration=1", "controller.parameter_error=2"), "controller.parameter_error is 2; allowed: 0..1"),
-        (("count: 3", "count: 0"), "random_poses.count is 0; allowed: 1..1000000"),
-        (("seed: 1", "margin: 0.5"), "random_poses.margin is 0.5; allowed: 0..0.49"),
         (("kind: drift", "kind: drif"), 'measures[0].kind is "drif"; allowed: settling_time'),
-        (
-            ("joints: [pitch]", "joints: [elbow]"),
-            "measures[0].joints of drift: unknown joint elbow; joints of PSM: yaw",
-        ),
+        (("joints: [pitch]", "joints: [elbow]"), "measures[0].joints of drift: unknown joint elbow; joints of PSM:"),
         (("kind: drift", "kind: drift, name: seed"), '"seed" cannot be a column'),
         (("kind: drift", 'kind: drift, name: "a,b"'), '"a,b" cannot be a column'),
         (("}]", "}, {kind: drift, time: 0.5, joints: [yaw]}]"), "measures must have different names"),
         (("time: 1", "time: 2"), "measures[0].time of drift is 2 s; allowed: 0.02..1 s"),
-        (("measures:", "measures: ["), "study.yaml"),
-        ((STUDY, "[1, 2]"), "study.yaml"),
         ((STUDY, ""), "study.yaml"),
     ],
 )
@@ -94,11 +75,6 @@ def test_rejects_invalid_files_and_outputs(study, tmp_path, capsys):
         assert main(["simulate", "study", str(study), "--output", str(output)]) == 2
         assert message in refusal(capsys.readouterr().err)
     assert study.read_text() == STUDY
-
-
-def test_rejects_invalid_number_of_workers(study, capsys):
-    for workers in ("0", "-1", "many"):
-        assert "--workers" in study_refusal(capsys, study, "--workers", workers)
 
 
 def test_rejects_invalid_schedulers(study, capsys):

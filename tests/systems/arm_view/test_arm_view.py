@@ -7,6 +7,7 @@ import threading
 import numpy as np
 import pytest
 from arm_copies import copy_arm
+from command_output import assert_refused
 from forked import run_forked
 
 import dvrk_drake as dvrk
@@ -268,8 +269,7 @@ def test_ghost_links_at_the_place_of_the_arm_are_hidden():
     assert overlay.meshcat.HasPath(f"/drake/{ghost.link_path('forearm_link')}")
     overlay.draw(np.zeros(7), desired=np.zeros(7))
     assert not shown("forearm_link")
-    with pytest.raises(DvrkDrakeError, match="unknown ghost other; known: desired"):
-        overlay.draw(q, ghosts={"other": q})
+    assert_refused(DvrkDrakeError, "unknown ghost other; known: desired", overlay.draw, q, ghosts={"other": q})
 
 
 class Recorder:
@@ -305,5 +305,4 @@ def test_drawing_does_not_change_a_simulation():
 
 def test_unknown_frames_in_the_arm_file_are_refused(tmp_path):
     path = copy_arm(tmp_path, "psm", mechanism=lambda text: text.replace("remote_center: dh_0", "remote_center: dh_x"))
-    with pytest.raises(ArmError, match=r"frames\.remote_center: the SDF has no frame dh_x"):
-        load_arm(path)
+    assert_refused(ArmError, r"frames\.remote_center: the SDF has no frame dh_x", load_arm, path)

@@ -38,12 +38,7 @@ def hold_by_another_sender(bench):
 
 
 OTHER_HOLD = "sender 8 commanded HOLD"
-TAKEOVERS = [
-    (expire, EXPIRED),
-    (jump, EXPIRED),
-    (call, "the period is 20 ms"),
-    (hold_by_another_sender, OTHER_HOLD),
-]
+TAKEOVERS = [(expire, EXPIRED), (jump, EXPIRED), (call, "the period is 20 ms"), (hold_by_another_sender, OTHER_HOLD)]
 
 
 def waits(bench, reason):

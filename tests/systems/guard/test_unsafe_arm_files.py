@@ -54,10 +54,7 @@ DANGERS = {
         [(ELBOW.format(1.0), ELBOW.format(1000.0))],
         "the coefficient of joint shoulder_pitch in the transmission of elbow_pitch is 1000; allowed: 1 +- 0.25, ",
     ),
-    "deleted coupling": (
-        [("  wrist_platform: {elbow_pitch: 0.6697, wrist_platform: 1.0}\n", "")],
-        PLATFORM.format(0),
-    ),
+    "deleted coupling": ([("  wrist_platform: {elbow_pitch: 0.6697, wrist_platform: 1.0}\n", "")], PLATFORM.format(0)),
     "wide limits": (
         [(YAW, "wrist_yaw: [-7.85398, 7.85398]")],
         "the position limits of wrist_yaw are -7.854..7.854; allowed: inside -1.178..1.178, ",

@@ -78,11 +78,7 @@ def test_states_and_homing():
 
 @pytest.mark.parametrize(
     ("state", "refused"),
-    [
-        ((), {"pause", "resume", "home"}),
-        (("enable",), {"resume"}),
-        (("enable", "pause"), {"enable", "home"}),
-    ],
+    [((), {"pause", "resume", "home"}), (("enable",), {"resume"}), (("enable", "pause"), {"enable", "home"})],
 )
 def test_unsupported_state_commands_are_refused(state, refused):
     for word in ("enable", "disable", "pause", "resume", "home", "unhome"):

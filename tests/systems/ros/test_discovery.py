@@ -124,12 +124,7 @@ def test_names_are_checked_before_the_search():
 
 @pytest.mark.parametrize(
     "command",
-    [
-        ["bridge"],
-        ["bridge", "deadman"],
-        ["sim-arm", "--transport", "ros"],
-        ["record", "a.mcap", "--transport", "ros"],
-    ],
+    [["bridge"], ["bridge", "deadman"], ["sim-arm", "--transport", "ros"], ["record", "a.mcap", "--transport", "ros"]],
 )
 def test_domain_number_is_checked_first(command, capsys, tmp_path, monkeypatch):
     pytest.importorskip("cyclonedds", reason="needs cyclonedds")

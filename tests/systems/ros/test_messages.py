@@ -36,9 +36,7 @@ TEXTS = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]
 NUMBERS = st.floats(allow_nan=True, allow_infinity=True)
 LISTS = st.lists(NUMBERS, max_size=9)
 HEADERS = st.builds(
-    messages.Header,
-    st.builds(messages.Time, st.integers(-(2**31), 2**31 - 1), st.integers(0, 2**32 - 1)),
-    TEXTS,
+    messages.Header, st.builds(messages.Time, st.integers(-(2**31), 2**31 - 1), st.integers(0, 2**32 - 1)), TEXTS
 )
 VECTORS = st.builds(messages.Vector3, NUMBERS, NUMBERS, NUMBERS)
 POSES = st.builds(
