@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from command_output import assert_refused, messages
 from loaded_arm import two_days
-from pydrake.multibody.tree import MultibodyForces
 from report_pages import printed
 
 import dvrk_drake as dvrk
@@ -46,18 +45,6 @@ def point_masses(reference, loaded, model, links=None):
     """Returns the estimates on all `links` for recordings and a DynamicModel."""
     prepared = [r if r is None else Observations(r, model.arm, model.section.signals) for r in (reference, loaded)]
     return estimate_payload(*prepared, model, links)
-
-
-def inverse_dynamics(arm, plant, context, q, v, vd):
-    """Returns the joint efforts (n,) that Drake computes, mapped to the independent joints of the linkage."""
-    order = [plant.GetJointByName(name).velocity_start() for name in arm.tree_joint_names]
-    tree = np.zeros((3, plant.num_velocities()))
-    tree[:, order] = arm.linkage.position(q), arm.linkage.velocity(v), arm.linkage.velocity(vd)
-    plant.SetPositions(context, tree[0])
-    plant.SetVelocities(context, tree[1])
-    forces = MultibodyForces(plant)
-    plant.CalcForceElementsContribution(context, forces)
-    return arm.linkage.pull_back_effort(plant.CalcInverseDynamics(context, tree[2], forces)[order])
 
 
 @pytest.mark.parametrize("case", CASES)

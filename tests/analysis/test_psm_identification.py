@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from command_output import refusal
+from command_output import refused
 
 from dvrk_drake.analysis.pose_identification import identify_static
-from dvrk_drake.cli import main
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ModelError
@@ -22,32 +21,30 @@ pytestmark = pytest.mark.numeric
 COUNT = 16
 
 
-@pytest.fixture(scope="module")
-def arm():
-    return load_arm("psm")
+ARM = load_arm("psm")
 
 
 @pytest.fixture(scope="module")
-def ground_truth_arm(arm, tmp_path_factory):
-    return perturbed_arm(arm, tmp_path_factory.mktemp("ground_truth_arm") / "psm.sdf", 5, max_shift=0.002)
+def ground_truth_arm(tmp_path_factory):
+    return perturbed_arm(ARM, tmp_path_factory.mktemp("ground_truth_arm") / "psm.sdf", 5, max_shift=0.002)
 
 
 @pytest.fixture(scope="module")
-def recording(arm, ground_truth_arm):
+def recording(ground_truth_arm):
     """Collects poses with the nominal model, so that the integrator compensates its errors."""
     generator = np.random.default_rng(6)
     laws = [DriveEffect("joint.yaw", "offset", 0.0, 0.05), DriveEffect("joint.roll", "cable sine", 1.0, 0.03)]
     station = ArmStation(
-        arm,
+        ARM,
         plant_arm=ground_truth_arm,
         closure="ball",
         modify_plant=lambda plant: set_joint_damping(
-            plant, ground_truth_arm, arm.per_joint(0.03, 0.3) * arm.effort_limits
+            plant, ground_truth_arm, ARM.per_joint(0.03, 0.3) * ARM.effort_limits
         ),
         effects=ArmEffects(cables=laws),
     )
-    poses = arm.sample_poses(COUNT, generator, margin=0.1)
-    return simulate_poses(station, IdentifiedModel.from_arm(arm), poses)
+    poses = ARM.sample_poses(COUNT, generator, margin=0.1)
+    return simulate_poses(station, IdentifiedModel.from_arm(ARM), poses)
 
 
 def true_torque(arm, ground_truth_arm, poses):
@@ -64,13 +61,13 @@ def true_torque(arm, ground_truth_arm, poses):
 
 
 @pytest.mark.slow
-def test_true_torque_is_identified_with_the_closed_linkage(arm, ground_truth_arm, recording):
-    np.testing.assert_allclose(recording.tau, true_torque(arm, ground_truth_arm, recording.q), atol=1e-3)
-    model = identify_static(recording, arm).model
-    fresh = arm.sample_poses(100, np.random.default_rng(7), margin=0.1)
-    truth = true_torque(arm, ground_truth_arm, fresh)
+def test_true_torque_is_identified_with_the_closed_linkage(ground_truth_arm, recording):
+    np.testing.assert_allclose(recording.tau, true_torque(ARM, ground_truth_arm, recording.q), atol=1e-3)
+    model = identify_static(recording, ARM).model
+    fresh = ARM.sample_poses(100, np.random.default_rng(7), margin=0.1)
+    truth = true_torque(ARM, ground_truth_arm, fresh)
     error = np.sqrt(np.mean((model.holding_torque(fresh) - truth) ** 2, axis=0))
-    assert np.all(error < np.maximum(0.03 * np.sqrt(np.mean(truth**2, axis=0)), 1e-3 * arm.effort_limits))
+    assert np.all(error < np.maximum(0.03 * np.sqrt(np.mean(truth**2, axis=0)), 1e-3 * ARM.effort_limits))
     found = {str(ActuatorEffect.of(e)) for e in model.effects}
     assert found >= {"joint.yaw offset", "joint.roll cable sine 1"}
     # At a yaw joint the torques of a spring and of a lifted weight are equal. Only one of them may be a candidate.
@@ -90,13 +87,12 @@ def test_true_torque_is_identified_with_the_closed_linkage(arm, ground_truth_arm
 def test_bad_recordings_are_rejected_in_one_line(recording, tmp_path, capsys, spoil, message):
     path, model = tmp_path / "bad.csv", tmp_path / "model.yaml"
     write_recording(spoil(recording), path)
-    assert main(["identify", str(path), "--arm", "psm", "--output", str(model)]) == 2
-    assert message in refusal(capsys.readouterr().err)
+    assert message in refused(capsys, "identify", path, "--arm", "psm", "--output", model)
     assert not model.exists()
 
 
-def test_prismatic_joint_has_no_angular_spring(arm):
-    model = IdentifiedModel.from_arm(arm)
+def test_prismatic_joint_has_no_angular_spring():
+    model = IdentifiedModel.from_arm(ARM)
     model.effects = [DriveEffect("joint.insertion", "cable sine", 1.0, 1.0)]
     with pytest.raises(
         ModelError, match=r"effects\[0\]: kind cable sine requires a revolute .*\.insertion is prismatic"

@@ -25,9 +25,7 @@ from dvrk_drake.recordings.recording import Recording
 pytestmark = [pytest.mark.numeric, pytest.mark.slow]
 
 
-@pytest.fixture(scope="module")
-def arm():
-    return load_arm("mtmr")
+ARM = load_arm("mtmr")
 
 
 def simulated(arm, poses=60, seed=0, noise=0.0, effects=(), coefficients=(), scale=1.0):
@@ -44,37 +42,37 @@ def column(model, attribute):
     return np.array([getattr(joint, attribute) for joint in model.joints])
 
 
-def test_least_squares_recovers_exact_parameters(arm):
-    recording, theta = simulated(arm)
-    model = identify_static(recording, arm, "paper").model
+def test_least_squares_recovers_exact_parameters():
+    recording, theta = simulated(ARM)
+    model = identify_static(recording, ARM, "paper").model
     np.testing.assert_allclose(model.theta, theta, atol=1e-12)
     assert column(model, "rms_fit").max() < 1e-12
     assert model.provenance.rank == 12
 
 
-def test_robust_method_recovers_parameters_and_effects(arm):
+def test_robust_method_recovers_parameters_and_effects():
     effects = tuple(ActuatorEffect(f"joint.wrist_{which}", "cable sine", 1.0) for which in ("platform", "pitch"))
-    recording, _ = simulated(arm, noise=0.005, effects=effects, coefficients=(0.05, -0.05), seed=4)
-    model = identify_static(recording, arm).model
+    recording, _ = simulated(ARM, noise=0.005, effects=effects, coefficients=(0.05, -0.05), seed=4)
+    model = identify_static(recording, ARM).model
     found = {ActuatorEffect.of(e): e.coefficient for e in model.effects}
     assert found[effects[0]] == pytest.approx(0.05, abs=0.004)
     assert found[effects[1]] == pytest.approx(-0.05, abs=0.002)
-    fresh, _ = simulated(arm, poses=200, seed=9, effects=effects, coefficients=(0.05, -0.05))
+    fresh, _ = simulated(ARM, poses=200, seed=9, effects=effects, coefficients=(0.05, -0.05))
     errors = validate_static(model, fresh).joints
-    for error, limit in zip(errors[1:6], arm.effort_limits[1:6], strict=True):
+    for error, limit in zip(errors[1:6], ARM.effort_limits[1:6], strict=True):
         assert error.rms_error < 0.005 * limit, error
     assert all(error.rms_error <= error.rms_torque for error in errors)
 
 
-def test_standard_errors_cover_the_truth_at_the_nominal_rate(arm):
+def test_standard_errors_cover_the_truth_at_the_nominal_rate():
     """The 95 % intervals of 40 noisy recordings, over all parameters above the noise."""
     inside = []
     for seed in range(40):
-        recording, theta = simulated(arm, noise=0.02, seed=seed)
+        recording, theta = simulated(ARM, noise=0.02, seed=seed)
         usable = np.ones(recording.q.shape, dtype=bool)
         from dvrk_drake.analysis.estimation.pose_effects import StaticProblem
 
-        fit = StaticProblem(arm, recording.q, recording.tau, usable).fit(()).fit
+        fit = StaticProblem(ARM, recording.q, recording.tau, usable).fit(()).fit
         inside.append(np.abs(fit.theta - theta) < 1.96 * np.sqrt(np.diag(fit.covariance)))
     assert 0.90 < np.mean(inside) <= 0.99
 
@@ -102,36 +100,36 @@ def test_gross_outliers_do_not_move_the_robust_fit():
     assert fit.outliers[5:9, 1].all()
 
 
-def test_poses_at_a_stop_are_excluded_and_named(arm):
-    recording, _ = simulated(arm, poses=40, noise=0.002)
+def test_poses_at_a_stop_are_excluded_and_named():
+    recording, _ = simulated(ARM, poses=40, noise=0.002)
     q, tau = recording.q.copy(), recording.tau.copy()
     q[3, 1:3] = [-0.15, -0.2]  # the sum is below -0.33
     tau[3, 1:3] -= 5.0
-    q[7, 5] = arm.position_upper[5]
+    q[7, 5] = ARM.position_upper[5]
     tau[7, 5] += 0.05
     tau[11, 3] = 2.0  # eight times what the motor can give
     dirty = dataclasses.replace(recording, q=q, tau=tau)
-    reasons = {(d.row, d.joints): d.reason for d in find_excluded(dirty, arm)}
+    reasons = {(d.row, d.joints): d.reason for d in find_excluded(dirty, ARM)}
     assert "parallelogram at -0.350 rad is at its stop" in reasons[3, (1, 2)]
     assert "wrist_yaw at 0.785 rad is at its stop" in reasons[7, (5,)]
     assert "wrist_platform effort 2 N m exceeds its limit of 0.309 N m" in reasons[11, (3,)]
     clean_rows = np.ones(40, bool)
     clean_rows[[3, 7, 11]] = False
     clean = dataclasses.replace(recording, q=q[clean_rows], tau=tau[clean_rows])
-    with_dirt, without = identify_static(dirty, arm).model, identify_static(clean, arm).model
+    with_dirt, without = identify_static(dirty, ARM).model, identify_static(clean, ARM).model
     np.testing.assert_allclose(with_dirt.theta[:3], without.theta[:3], rtol=0.05, atol=0)
 
 
-def test_joint_without_measured_torque_has_no_feedforward(arm):
-    recording, _ = simulated(arm, noise=0.002)
+def test_joint_without_measured_torque_has_no_feedforward():
+    recording, _ = simulated(ARM, noise=0.002)
     tau = recording.tau.copy()
     tau[:, 6] = 1e-5
-    model = identify_static(dataclasses.replace(recording, tau=tau), arm).model
+    model = identify_static(dataclasses.replace(recording, tau=tau), ARM).model
     assert model.joints[6].feedforward_scale == 0.0
     assert np.all(model.holding_torque(recording.q)[:, 6] == 0.0)
 
 
-def test_pure_friction_is_not_worse_than_zero_torque(arm):
+def test_pure_friction_is_not_worse_than_zero_torque():
     """Wrist torques are unrelated to the pose. Over seeds, errors on other poses do not increase beyond chance."""
     ratios = []
     for seed in range(6):
@@ -139,95 +137,95 @@ def test_pure_friction_is_not_worse_than_zero_torque(arm):
 
         def with_friction(recording, generator=generator):
             tau = recording.tau.copy()
-            tau[:, 3:] = generator.uniform(-0.1, 0.1, (len(tau), 4)) * arm.effort_limits[3:]
+            tau[:, 3:] = generator.uniform(-0.1, 0.1, (len(tau), 4)) * ARM.effort_limits[3:]
             return dataclasses.replace(recording, tau=tau)
 
-        model = identify_static(with_friction(simulated(arm, seed=seed)[0]), arm).model
-        errors = validate_static(model, with_friction(simulated(arm, poses=200, seed=100 + seed)[0])).joints
+        model = identify_static(with_friction(simulated(ARM, seed=seed)[0]), ARM).model
+        errors = validate_static(model, with_friction(simulated(ARM, poses=200, seed=100 + seed)[0])).joints
         ratios.append([e.rms_error / e.rms_torque for e in errors[3:]])
     assert np.mean(ratios) < 1.03
     assert np.max(ratios) < 1.2
 
 
-def test_actuator_coordinates_give_the_same_model(arm):
-    recording, _ = simulated(arm, noise=0.002)
+def test_actuator_coordinates_give_the_same_model():
+    recording, _ = simulated(ARM, noise=0.002)
     actuator = Recording(
-        q=arm.transmission.position(recording.q),
-        tau=arm.transmission.inverse.pull_back_effort(recording.tau),
+        q=ARM.transmission.position(recording.q),
+        tau=ARM.transmission.inverse.pull_back_effort(recording.tau),
         coordinates="actuator",
         source="simulated",
     )
-    model = identify_static(recording, arm, "paper").model
-    np.testing.assert_allclose(identify_static(actuator, arm, "paper").model.theta, model.theta, atol=1e-12)
+    model = identify_static(recording, ARM, "paper").model
+    np.testing.assert_allclose(identify_static(actuator, ARM, "paper").model.theta, model.theta, atol=1e-12)
     np.testing.assert_allclose(
-        arm.transmission.pull_back_effort(predict_static(model, actuator)),
+        ARM.transmission.pull_back_effort(predict_static(model, actuator)),
         model.holding_torque(recording.q),
         atol=1e-12,
     )
 
 
-def test_too_few_poses_and_too_low_rank_are_rejected(arm):
-    recording, _ = simulated(arm, poses=4)
-    assert_refused(IdentificationError, "4 distinct poses found", identify_static, recording, arm)
-    same, _ = simulated(arm, poses=10)
+def test_too_few_poses_and_too_low_rank_are_rejected():
+    recording, _ = simulated(ARM, poses=4)
+    assert_refused(IdentificationError, "4 distinct poses found", identify_static, recording, ARM)
+    same, _ = simulated(ARM, poses=10)
     same = dataclasses.replace(same, q=np.tile(same.q[:1], (10, 1)), tau=np.tile(same.tau[:1], (10, 1)))
-    assert_refused(IdentificationError, r"determine only \d of 12 base parameters", identify_static, same, arm, "paper")
-    assert_refused(IdentificationError, "1 distinct pose found", identify_static, same, arm)
+    assert_refused(IdentificationError, r"determine only \d of 12 base parameters", identify_static, same, ARM, "paper")
+    assert_refused(IdentificationError, "1 distinct pose found", identify_static, same, ARM)
 
 
-def test_repeated_samples_are_averaged_before_validation(arm):
+def test_repeated_samples_are_averaged_before_validation():
     """Ten samples of each of 12 poses with friction per pose give the same result as their 12 averages."""
-    recording, _ = simulated(arm, poses=12)
+    recording, _ = simulated(ARM, poses=12)
     generator = np.random.default_rng(5)
-    friction = 0.1 * arm.effort_limits * generator.uniform(-1, 1, recording.q.shape)
-    noise = 1e-4 * arm.effort_limits * generator.normal(size=(10, *recording.q.shape))
+    friction = 0.1 * ARM.effort_limits * generator.uniform(-1, 1, recording.q.shape)
+    noise = 1e-4 * ARM.effort_limits * generator.normal(size=(10, *recording.q.shape))
     samples = Recording(
         q=np.repeat(recording.q, 10, axis=0),
         tau=(recording.tau + friction + noise).transpose(1, 0, 2).reshape(-1, 7),
         source="samples",
     )
     averages = Recording(q=recording.q, tau=recording.tau + friction + noise.mean(axis=0), source="averages")
-    ours, reference = identify_static(samples, arm), identify_static(averages, arm)
+    ours, reference = identify_static(samples, ARM), identify_static(averages, ARM)
     assert len(ours.recording) == 12
     np.testing.assert_allclose(ours.model.theta, reference.model.theta, atol=1e-9)
 
 
-def test_joint_that_did_not_move_has_no_feedforward(arm):
-    recording, _ = simulated(arm, poses=40)
+def test_joint_that_did_not_move_has_no_feedforward():
+    recording, _ = simulated(ARM, poses=40)
     generator = np.random.default_rng(0)
     q = recording.q.copy()
     q[:, 3:] = [0.5, 0.7, 0.2, 0.1]
-    model = static_model(arm)
-    tau = model.torque(q, model.gravity.base_values) + 0.05 * arm.effort_limits * generator.uniform(-1, 1, q.shape)
-    result = identify_static(Recording(q=q, tau=tau, source="fixed wrist"), arm).model
+    model = static_model(ARM)
+    tau = model.torque(q, model.gravity.base_values) + 0.05 * ARM.effort_limits * generator.uniform(-1, 1, q.shape)
+    result = identify_static(Recording(q=q, tau=tau, source="fixed wrist"), ARM).model
     assert np.all(result.feedforward_scale[3:] == 0.0)
-    fresh, _ = simulated(arm, poses=100, seed=3)
+    fresh, _ = simulated(ARM, poses=100, seed=3)
     for error in validate_static(result, fresh).joints:
         assert error.rms_error <= error.rms_torque, error
 
 
-def test_torques_in_the_wrong_unit_are_rejected(arm):
-    recording, _ = simulated(arm)
+def test_torques_in_the_wrong_unit_are_rejected():
+    recording, _ = simulated(ARM)
     with pytest.raises(RecordingError, match="Check the unit"):
-        identify_static(dataclasses.replace(recording, tau=1000 * recording.tau), arm)
+        identify_static(dataclasses.replace(recording, tau=1000 * recording.tau), ARM)
 
 
-def test_moving_recording_is_rejected(arm):
-    recording, _ = simulated(arm)
+def test_moving_recording_is_rejected():
+    recording, _ = simulated(ARM)
     t = 0.005 * np.arange(len(recording))
     for moving in (
         dataclasses.replace(recording, qd=np.full_like(recording.q, 0.2)),
         dataclasses.replace(recording, t=t),
     ):
-        assert_refused(IdentificationError, "the arm moves", identify_static, moving, arm)
+        assert_refused(IdentificationError, "the arm moves", identify_static, moving, ARM)
     # Poses with time stamps: the arm moves between them and rests at each.
-    assert identify_static(dataclasses.replace(recording, t=8.0 * np.arange(len(recording))), arm, "paper")
+    assert identify_static(dataclasses.replace(recording, t=8.0 * np.arange(len(recording))), ARM, "paper")
 
 
-def test_model_file_round_trip_and_rejections(arm, tmp_path):
+def test_model_file_round_trip_and_rejections(tmp_path):
     spring = ActuatorEffect("joint.wrist_pitch", "cable sine", 1.0)
-    recording, _ = simulated(arm, noise=0.002, effects=(spring,), coefficients=(-0.05,))
-    model = identify_static(recording, arm).model
+    recording, _ = simulated(ARM, noise=0.002, effects=(spring,), coefficients=(-0.05,))
+    model = identify_static(recording, ARM).model
     model.save(tmp_path / "m.yaml")
     again = IdentifiedModel.load(tmp_path / "m.yaml")
     assert again == model
@@ -272,9 +270,9 @@ def test_moved_model_files_are_loaded(tmp_path):
 # Recording of the paper.
 
 
-def test_paper_method_reproduces_figure_4(arm, shared_data):
+def test_paper_method_reproduces_figure_4(shared_data):
     recording = read_recording(shared_data / "mtm_static/mtm_2015_good72.csv")
-    result = identify_static(recording, arm, "paper")
+    result = identify_static(recording, ARM, "paper")
     with open(shared_data / "mtm_static/paper_fig4_squared_errors.csv") as stream:
         rows = list(csv.reader(stream))[1:]
     published = np.array(rows, dtype=float)[:, 1:]
@@ -295,34 +293,34 @@ def test_paper_method_reproduces_figure_4(arm, shared_data):
 @pytest.mark.parametrize(
     "name", ["mtm_2015_good72", "mtm_2015_apr18_all80", "mtmr_2017_sweep40", "mtmr_2017_coupled12_may10"]
 )
-def test_default_method_beats_zero_torque_on_held_out_poses(arm, shared_data, name):
-    model = identify_static(read_recording(shared_data / f"mtm_static/{name}.csv"), arm).model
+def test_default_method_beats_zero_torque_on_held_out_poses(shared_data, name):
+    model = identify_static(read_recording(shared_data / f"mtm_static/{name}.csv"), ARM).model
     for joint in model.joints:
         assert joint.rms_leave_one_out_included <= joint.rms_zero_torque_included, joint
         assert joint.rms_cross_validation_included <= 1.02 * joint.rms_zero_torque_included, joint
 
 
-def test_default_method_beats_the_paper_on_held_out_poses(arm, shared_data):
+def test_default_method_beats_the_paper_on_held_out_poses(shared_data):
     recording = read_recording(shared_data / "mtm_static/mtm_2015_good72.csv")
-    ours, paper = identify_static(recording, arm), identify_static(recording, arm, "paper")
+    ours, paper = identify_static(recording, ARM), identify_static(recording, ARM, "paper")
     excluded = np.zeros(recording.q.shape, bool)
     for measurement in ours.excluded:
         excluded[measurement.row, list(measurement.joints)] = True
     for j in range(7):
         use = ~excluded[:, j]
         rms = [np.sqrt(np.mean(r.leave_one_out_residuals[use, j] ** 2)) for r in (ours, paper)]
-        assert rms[0] < rms[1], arm.joint_names[j]
+        assert rms[0] < rms[1], ARM.joint_names[j]
 
 
-def test_prediction_of_another_day_beats_zero_torque(arm, shared_data):
-    model = identify_static(read_recording(shared_data / "mtm_static/mtm_2015_good72.csv"), arm).model
+def test_prediction_of_another_day_beats_zero_torque(shared_data):
+    model = identify_static(read_recording(shared_data / "mtm_static/mtm_2015_good72.csv"), ARM).model
     other = validate_static(model, read_recording(shared_data / "mtm_static/mtm_2015_apr18_all80.csv"))
     for joint in other.joints:
         assert joint.rms_error_included <= joint.rms_torque_included, joint
 
 
-def test_poses_at_a_stop_are_named_in_a_real_recording(arm, shared_data):
-    result = identify_static(read_recording(shared_data / "mtm_static/mtm_2015_apr18_all80.csv"), arm)
+def test_poses_at_a_stop_are_named_in_a_real_recording(shared_data):
+    result = identify_static(read_recording(shared_data / "mtm_static/mtm_2015_apr18_all80.csv"), ARM)
     # Line numbers of the file. Line 72 repeats the pose of line 62.
     line = {d: int(d.where.rpartition(" ")[2]) for d in result.excluded}
     assert {62, 64, 68, 74, 78} <= {line[d] for d in result.excluded if "parallelogram" in d.reason}

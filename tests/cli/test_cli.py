@@ -10,7 +10,7 @@ import sys
 
 import numpy as np
 import pytest
-from command_output import messages, refusal
+from command_output import messages, refusal, refused
 from forked import forked_program
 from recordings import csv_block
 
@@ -35,12 +35,6 @@ def folder(tmp_path_factory, identified_poses):
     write_recording(identified_poses.other, folder / "other.csv")
     identified_poses.result.save(folder / "model.yaml")
     return folder
-
-
-def fails(capsys, *arguments):
-    """Runs a command that must fail, and returns its error line."""
-    assert main([str(a) for a in arguments]) == 2
-    return refusal(capsys.readouterr().err)
 
 
 def test_identify_writes_files_and_prints_parameters(folder, identified_poses, tmp_path, monkeypatch, capsys):
@@ -181,11 +175,11 @@ def test_gravity_option_changes_the_base_parameters(capsys):
 def test_input_files_are_never_replaced(folder, capsys):
     poses, model = folder / "poses.csv", folder / "model.yaml"
     before = poses.read_bytes(), model.read_bytes()
-    assert "is an input" in fails(capsys, "identify", poses, "--arm", "mtmr", "--output", poses)
-    assert "is an input" in fails(capsys, "predict", poses, "--model", model, "--output", poses)
-    assert "is an input" in fails(capsys, "validate", poses, "--model", model, "--json", model)
-    assert "not a regular file" in fails(capsys, "predict", poses, "--model", model, "--output", folder)
-    assert "--output requires --format" in fails(capsys, "equations", "--arm", "mtml", "--output", folder / "x.txt")
+    assert "is an input" in refused(capsys, "identify", poses, "--arm", "mtmr", "--output", poses)
+    assert "is an input" in refused(capsys, "predict", poses, "--model", model, "--output", poses)
+    assert "is an input" in refused(capsys, "validate", poses, "--model", model, "--json", model)
+    assert "not a regular file" in refused(capsys, "predict", poses, "--model", model, "--output", folder)
+    assert "--output requires --format" in refused(capsys, "equations", "--arm", "mtml", "--output", folder / "x.txt")
     assert (poses.read_bytes(), model.read_bytes()) == before
 
 
@@ -220,12 +214,12 @@ def test_existing_file_is_kept_without_overwrite(command, tmp_path, monkeypatch,
     monkeypatch.chdir(tmp_path)
     mine = tmp_path / "mine.csv"
     mine.write_text("mine")
-    error = fails(capsys, *command.split(), "mine.csv")
+    error = refused(capsys, *command.split(), "mine.csv")
     assert error.startswith("dvrk-drake: error: mine.csv") and "exists" in error
     if not command.startswith(KEEP_ALWAYS):
         assert error.endswith("already exists. Choose another file, or replace it with --overwrite.")
     if "none" in command:
-        assert "none" in fails(capsys, *command.split(), "mine.csv", "--overwrite")
+        assert "none" in refused(capsys, *command.split(), "mine.csv", "--overwrite")
     assert mine.read_text() == "mine" and len(list(tmp_path.iterdir())) == 1
 
 
@@ -248,10 +242,10 @@ def test_folder_with_files_is_kept_without_overwrite(command, tmp_path, monkeypa
     monkeypatch.chdir(tmp_path)
     (tmp_path / "full").mkdir()
     (tmp_path / "full/mine.txt").write_text("mine")
-    error = fails(capsys, *command.split(), "full")
+    error = refused(capsys, *command.split(), "full")
     assert error.endswith("full: folder is not empty; choose another folder, or write into it with --overwrite")
     if "none" in command:
-        assert "none" in fails(capsys, *command.split(), "full", "--overwrite")
+        assert "none" in refused(capsys, *command.split(), "full", "--overwrite")
     assert [path.name for path in tmp_path.rglob("*")] == ["full", "mine.txt"]
 
 
@@ -296,7 +290,7 @@ def test_commands_accept_an_arm_file(folder, tmp_path, capsys):
     assert main(["validate", f"{folder}/other.csv", "--model", str(model)]) == 0
     capsys.readouterr()
     (tmp_path / "other.yaml").write_text(text + limit.replace("elbow_pitch", "elbow"))
-    assert 'coupled_limits.p: unknown joint "elbow"; allowed: outer_yaw' in fails(
+    assert 'coupled_limits.p: unknown joint "elbow"; allowed: outer_yaw' in refused(
         capsys, "equations", "--arm", tmp_path / "other.yaml"
     )
 
@@ -313,7 +307,7 @@ def test_validate_writes_null_for_a_joint_without_effort(folder, tmp_path):
 
 def test_model_of_another_arm_is_named(folder, tmp_path, capsys):
     (tmp_path / "two_joints.csv").write_text("q1,q2,tau1,tau2\n0,0,0,0\n")
-    message = fails(capsys, "validate", tmp_path / "two_joints.csv", "--model", folder / "model.yaml")
+    message = refused(capsys, "validate", tmp_path / "two_joints.csv", "--model", folder / "model.yaml")
     assert "missing columns q3" in message and f"{folder}/model.yaml is a model of MTM" in message
 
 
@@ -370,7 +364,7 @@ def test_rejects_the_same_path_for_two_outputs(folder, tmp_path, monkeypatch, ca
     export = ["export", "--model", f"{folder}/model.yaml", "--sdf", "o.sdf", "--urdf"]
     identify = ["identify", f"{folder}/poses.csv", "--arm", "mtmr", "--output", "o", "--plots", "o"]
     for command in ([*export, "./o.sdf"], identify):
-        assert "is given for two outputs" in fails(capsys, *command)
+        assert "is given for two outputs" in refused(capsys, *command)
     assert not list(tmp_path.iterdir())
 
 
@@ -378,7 +372,7 @@ def test_meshes_are_not_replaced_by_default(folder, tmp_path, capsys):
     (tmp_path / "o_meshes").mkdir()
     (tmp_path / "o_meshes/mine.txt").write_text("mine")
     export = ["export", "--model", f"{folder}/model.yaml", "--sdf", f"{tmp_path}/o.sdf"]
-    assert "o_meshes: the folder contains files already" in fails(capsys, *export)
+    assert "o_meshes: the folder contains files already" in refused(capsys, *export)
     assert not (tmp_path / "o.sdf").exists()
     assert main([*export, "--overwrite"]) == 0
     assert (tmp_path / "o_meshes/mine.txt").read_text() == "mine"

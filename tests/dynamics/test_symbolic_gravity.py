@@ -21,9 +21,7 @@ from dvrk_drake.models.plant import holding_torque, holding_torques, make_arm_pl
 pytestmark = [pytest.mark.drake_api, pytest.mark.numeric]
 
 
-@pytest.fixture(scope="module")
-def arm():
-    return load_arm("mtmr")
+ARM = load_arm("mtmr")
 
 
 @pytest.fixture(scope="module", params=["mtmr", "psm"])
@@ -42,18 +40,18 @@ def evaluate(gravity, q):
     return np.array([np.array(function(*pose, 9.81), dtype=float) for pose in q])
 
 
-def test_regressor_is_that_of_the_paper_in_other_frames(arm, random_q):
+def test_regressor_is_that_of_the_paper_in_other_frames(random_q):
     """The frames of the paper and of the dVRK differ only by signs and by the order of the parameters."""
-    ours = evaluate(derive_gravity(arm), random_q).reshape(-1, 12)
+    ours = evaluate(derive_gravity(ARM), random_q).reshape(-1, 12)
     paper = 9.81 * np.concatenate([paper_regressor(q) for q in random_q])
     T = np.linalg.lstsq(ours, paper, rcond=None)[0]
     np.testing.assert_allclose(ours @ T, paper, atol=1e-12)
     np.testing.assert_allclose(np.sort(np.abs(T)), np.repeat([[0.0] * 11 + [1.0]], 12, axis=0), atol=1e-12)
 
 
-def test_dvrk_controller_mapping(arm):
+def test_dvrk_controller_mapping():
     """Tests columns 0 to 9 of the regressor of the dVRK's controller."""
-    gravity = derive_gravity(arm)
+    gravity = derive_gravity(ARM)
     numbers = dict(zip(gravity.base.names, gravity.base_values, strict=True))
     q = np.random.default_rng(0).uniform(-1, 1, (20, 7))
     s2, c2, s4, s5, s6 = np.sin(q[:, 1]), np.cos(q[:, 1]), np.sin(q[:, 3]), np.sin(q[:, 4]), np.sin(q[:, 5])
@@ -72,7 +70,7 @@ def test_dvrk_controller_mapping(arm):
         "m6 c6x": C * c6 * s4 - S * s5 * s6 + C * c4 * c5 * s6,
     }
     tau2 = 9.81 * sum(numbers[name] * column for name, column in p.items())
-    model = static_model(arm)
+    model = static_model(ARM)
     theta = gravity.base_values.copy()
     for name in ("m7 c7x", "m7 c7y"):
         theta[gravity.base.names.index(name)] = 0.0
@@ -140,9 +138,9 @@ def test_symbolic_frames_equal_those_of_the_plant(random_q, name, labels):
             )
 
 
-def test_joint_effects_add_their_torque(arm):
+def test_joint_effects_add_their_torque():
     effects = (ActuatorEffect("joint.wrist_platform", "cable sine", 1.0), ActuatorEffect("joint.outer_yaw", "offset"))
-    plain, model = static_model(arm), static_model(arm, effects)
+    plain, model = static_model(ARM), static_model(ARM, effects)
     q = np.random.default_rng(0).normal(size=(5, 7))
     beta = plain.gravity.base_values
     extra = model.torque(q, [*beta, 0.3, -0.2]) - plain.torque(q, beta)

@@ -7,7 +7,7 @@ from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
-from command_output import refusal
+from command_output import refused
 from figure_rules import checked_figures
 from paper_regressor import paper_regressor
 
@@ -118,8 +118,7 @@ def no_recordings(monkeypatch):
 
 def test_figure_4_without_recording_gives_one_line_error(no_recordings, tmp_path, capsys):
     output = tmp_path / "out"
-    assert main(["reproduce", "fig4", "--folder", str(output)]) == 2
-    error = refusal(capsys.readouterr().err)
+    error = refused(capsys, "reproduce", "fig4", "--folder", output)
     assert "mtm_2015_good72.csv" in error
     assert "--data" in error
     assert not output.exists()

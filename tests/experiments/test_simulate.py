@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from command_output import assert_refused, refusal
+from command_output import assert_refused, refused
 from pydrake.symbolic import Variable
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import LeafSystem
@@ -127,20 +127,8 @@ def test_other_commands_read_the_recording(tmp_path, capsys, monkeypatch):
     model, recording, errors = (str(tmp_path / name) for name in ("model.yaml", "held.csv", "errors.json"))
     IdentifiedModel.from_arm(PSM).save(model)
     start = "start=[0.5,0.4,0.1,0.3,0.2,-0.3,0.4]"
-    command = [
-        "simulate",
-        "--arm",
-        "psm",
-        "--set",
-        start,
-        "--set",
-        "duration=1",
-        "--output",
-        recording,
-        "--plots",
-        str(tmp_path / "plots"),
-    ]
-    assert main(command) == 0
+    command = ["simulate", "--arm", "psm", "--set", start, "--set", "duration=1", "--output", recording]
+    assert main([*command, "--plots", str(tmp_path / "plots")]) == 0
     assert (tmp_path / "plots/simulation.png").stat().st_size > 10_000
     assert "Largest tracking error" in capsys.readouterr().out
     assert main(["validate", recording, "--model", model, "--json", errors]) == 0
@@ -172,8 +160,7 @@ def test_other_commands_read_the_recording(tmp_path, capsys, monkeypatch):
 )
 def test_invalid_settings_give_one_line_error(setting, message, capsys, tmp_path):
     output = tmp_path / "out.csv"
-    assert main(["simulate", "--arm", "psm", "--set", setting, "--output", str(output)]) == 2
-    assert message in refusal(capsys.readouterr().err)
+    assert message in refused(capsys, "simulate", "--arm", "psm", "--set", setting, "--output", output)
     assert not output.exists()
 
 

@@ -5,12 +5,11 @@ from functools import partial
 
 import numpy as np
 import pytest
-from command_output import refusal
+from command_output import refused
 from figure_rules import checked_figures
 from report_pages import printed
 from scipy.optimize import brentq
 
-from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.experiments.scenario import load_scenario
@@ -343,27 +342,21 @@ def test_rejects_invalid_gains_files(tmp_path, text, message):
         load_gains(path)
 
 
-def error_line(capsys, *arguments):
-    """Returns the single line that the command prints before it exits with code 2."""
-    assert main(arguments) == 2
-    return refusal(capsys.readouterr().err)
-
-
 def test_commands_reject_invalid_options(tmp_path, capsys):
-    assert 'unknown arm "mtm"' in error_line(capsys, "simulate", "tune", "--arm", "mtm")
-    assert 'Invalid value "guess" for --method' in error_line(
+    assert 'unknown arm "mtm"' in refused(capsys, "simulate", "tune", "--arm", "mtm")
+    assert 'Invalid value "guess" for --method' in refused(
         capsys, "simulate", "tune", "--arm", "psm", "--method", "guess"
     )
-    assert "its folder does not exist" in error_line(
+    assert "its folder does not exist" in refused(
         capsys, "simulate", "tune", "--arm", "psm", "--output", str(tmp_path / "no" / "g")
     )
-    assert "no such file" in error_line(capsys, "simulate", "--arm", "mtml", "--set", "controller.gains=none.yaml")
+    assert "no such file" in refused(capsys, "simulate", "--arm", "mtml", "--set", "controller.gains=none.yaml")
     few = tmp_path / "few.yaml"
     save_gains(Gains([1.0], [1.0], [1.0]), few, "of one joint")
-    assert "gains.kp has 1 number; allowed: 7" in error_line(
+    assert "gains.kp has 1 number; allowed: 7" in refused(
         capsys, "simulate", "--arm", "mtml", "--set", f"controller.gains={few}"
     )
-    assert "mode gravity does not use gains" in error_line(capsys, "control", "--arm", "mtml", "--gains", str(few))
+    assert "mode gravity does not use gains" in refused(capsys, "control", "--arm", "mtml", "--gains", str(few))
 
 
 @pytest.mark.slow

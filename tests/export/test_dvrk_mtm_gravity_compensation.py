@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_output import assert_refused, refusal
+from command_output import assert_refused, refused
 from figure_rules import checked_figures
 
 from dvrk_drake.cli import main
@@ -293,8 +293,7 @@ def test_tilted_base_is_rejected_or_approximated(tmp_path, capsys):
     model.base_parameters = IdentifiedModel.from_arm(model.arm).base_parameters
     given, out = tmp_path / "model.yaml", tmp_path / "gc.json"
     model.save(given)
-    assert main(["export", "--model", str(given), "--dvrk-gc", str(out), "--gc-tolerance", "0.001"]) == 2
-    error = refusal(capsys.readouterr().err)
+    error = refused(capsys, "export", "--model", given, "--dvrk-gc", out, "--gc-tolerance", "0.001")
     assert "base tilt of 2.3 deg" in error and not out.exists()
     # With the option in the message, the error of the file is the error in the message.
     tolerance = error.split("--gc-tolerance ")[1]
@@ -326,8 +325,7 @@ def test_invalid_file_is_rejected_in_one_line(change, message, tmp_path, capsys)
     content = json.loads(path.read_text())
     change(content["GC_controller"])
     path.write_text(json.dumps(content))
-    assert main(["export", "compare", str(path), "--arm", "mtml"]) == 2
-    error = refusal(capsys.readouterr().err)
+    error = refused(capsys, "export", "compare", path, "--arm", "mtml")
     assert message in error and str(path) in error
 
 
@@ -386,13 +384,8 @@ def test_comparison_detects_runaway_clipping_and_wrong_sign(tmp_path, monkeypatc
     found = compare_compensation(altered, model)
     assert found.joints[1].runaway > 0.3 and found.joints[1].polynomial == pytest.approx(20 * 1.13446**4, rel=0.01)
     assert found.joints[2].clipped == pytest.approx(0.5, abs=0.01)
-    mirrored = dataclasses.replace(
-        file,
-        positive=-file.positive,
-        negative=-file.negative,
-        torque_lower=-file.torque_upper,
-        torque_upper=-file.torque_lower,
-    )
+    limits = {"torque_lower": -file.torque_upper, "torque_upper": -file.torque_lower}
+    mirrored = dataclasses.replace(file, positive=-file.positive, negative=-file.negative, **limits)
     opposed = compare_compensation(mirrored, model).joints
     assert opposed[1].opposed > 0.8 and opposed[4].opposed > 0.5
     with checked_figures(monkeypatch):
@@ -410,8 +403,7 @@ def test_export_and_compare_commands(tmp_path, capsys):
     joints = json.loads(report.read_text())["joints"]
     assert [j["clipped"] for j in joints] == [0.0] * 7 and joints[0]["rms_inside"] is None
     out.unlink()
-    assert main(["export", "--arm", "mtml", "--dvrk-gc", str(out), "--gc-tolerance", "0.001"]) == 2
-    error = refusal(capsys.readouterr().err)
+    error = refused(capsys, "export", "--arm", "mtml", "--dvrk-gc", out, "--gc-tolerance", "0.001")
     assert not out.exists()
     # The command with the option in the message is accepted, and the command with the default tolerance.
     options = error.split("repeat the command with ")[1].split()

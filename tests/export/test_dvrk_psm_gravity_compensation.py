@@ -5,7 +5,7 @@ import os
 
 import numpy as np
 import pytest
-from command_output import assert_refused, refusal
+from command_output import assert_refused, refusal, refused
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from dvrk_drake.cli import main
@@ -135,8 +135,7 @@ def test_gravity_that_mounting_pitch_cannot_express_is_refused(tmp_path, capsys,
     for name, gravity in {"pitch": [0.0, 6.9367, -6.9367], "roll": [6.9367, 0.0, -6.9367]}.items():
         IdentifiedModel.from_arm(nominal.with_gravity(gravity)).save(f"{name}.yaml")
     command = ["export", "--dvrk-kinematic-gc", "gc.json", "--model"]
-    assert main([*command, "roll.yaml"]) == 2
-    error = refusal(capsys.readouterr().err)
+    error = refused(capsys, *command, "roll.yaml")
     assert "cause: sideways base tilt of 45 deg, which mounting_pitch cannot express" in error
     assert not os.path.exists("gc.json")
     assert main([*command, "pitch.yaml"]) == 0
@@ -162,8 +161,7 @@ def test_mounting_pitch_of_the_configuration_is_checked(tmp_path, capsys, monkey
         '{"kinematic_gc": "gc.json", "mounting_pitch": -45}': "arm.json: mounting_pitch is -45; allowed: a number",
     }.items():
         beside.write_text(content)
-        assert main(command) == 2
-        assert message in refusal(capsys.readouterr().err) and not os.path.exists("gc.json")
+        assert message in refused(capsys, *command) and not os.path.exists("gc.json")
     beside.write_text('{"kinematic_gc": "other.json"}')
     assert main(command) == 0
     other.write_text('{"mounting_pitch": -0.785398, // -45.0 degrees, "https://a"\n "kinematic_gc": "gc.json"}')

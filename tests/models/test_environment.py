@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from command_output import assert_refused, refusal
+from command_output import assert_refused, refused
 from models_in_directives import OTHER_ARM
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
@@ -11,7 +11,6 @@ import dvrk_drake as dvrk
 from dvrk_drake.analysis.excitation.motion_limits import CollisionDetector, first_collision, motion_violations
 from dvrk_drake.analysis.excitation.periodic_motion import PeriodicMotion
 from dvrk_drake.analysis.excitation.pose_file import load_poses, pose_environment, save_poses
-from dvrk_drake.cli import main
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models import plant as plants
 from dvrk_drake.models.plant import add_arm, set_arm_positions
@@ -19,40 +18,38 @@ from dvrk_drake.models.plant import add_arm, set_arm_positions
 pytestmark = pytest.mark.drake_api
 
 
-@pytest.fixture(scope="module")
-def arm():
-    return dvrk.load_arm("mtml")
+ARM = dvrk.load_arm("mtml")
 
 
-def test_collision_with_another_arm_ends_at_a_distance(arm):
+def test_collision_with_another_arm_ends_at_a_distance():
     """Two equal arms at the same pose have a distance of 0 at no offset, and no collision beyond their width."""
-    q = np.zeros((1, arm.num_joints))
-    assert first_collision(arm, q) is None
-    found = [first_collision(arm, q, dvrk.Environment(directives=OTHER_ARM.format(x=x))) for x in (0.02, 0.1, 0.5, 2.0)]
+    q = np.zeros((1, ARM.num_joints))
+    assert first_collision(ARM, q) is None
+    found = [first_collision(ARM, q, dvrk.Environment(directives=OTHER_ARM.format(x=x))) for x in (0.02, 0.1, 0.5, 2.0)]
     assert found[0] and found[0][1].startswith("collision of ") and " and other::" in found[0][1]
     assert found[-1] is None
     touches = [entry is not None for entry in found]
     assert touches == sorted(touches, reverse=True)
 
 
-def test_objects_may_touch_each_other_and_the_base(arm):
+def test_objects_may_touch_each_other_and_the_base():
     """The base link of the other arm is at the same position as the own base."""
-    detector = CollisionDetector(arm, dvrk.Environment(table=0.0, directives=OTHER_ARM.format(x=0.0)))
-    for pose in arm.sample_poses(20, np.random.default_rng(0)):
+    detector = CollisionDetector(ARM, dvrk.Environment(table=0.0, directives=OTHER_ARM.format(x=0.0)))
+    for pose in ARM.sample_poses(20, np.random.default_rng(0)):
         assert "collision of base_link and" not in detector.collision(pose)
 
 
 @pytest.mark.slow
-def test_motion_keeps_its_distance_from_another_arm(arm, tmp_path):
+def test_motion_keeps_its_distance_from_another_arm(tmp_path):
     environment = dvrk.Environment(directives=OTHER_ARM.format(x=-0.27))
     limits = dvrk.MotionLimits(traverse_time=2.0, environment=environment)
     options = {"duration": 4.0, "period": 4.0, "harmonics": 2, "starts": 1}
-    free = dvrk.design_excitation(arm, **options).motion
-    assert any(" and other::" in line for line in motion_violations(free, arm, limits))
-    motion = dvrk.design_excitation(arm, limits=limits, **options).motion
-    assert motion_violations(motion, arm, limits) == []
+    free = dvrk.design_excitation(ARM, **options).motion
+    assert any(" and other::" in line for line in motion_violations(free, ARM, limits))
+    motion = dvrk.design_excitation(ARM, limits=limits, **options).motion
+    assert motion_violations(motion, ARM, limits) == []
     motion.save(tmp_path / "motion.yaml")
-    assert PeriodicMotion.load(tmp_path / "motion.yaml", arm).environment == environment
+    assert PeriodicMotion.load(tmp_path / "motion.yaml", ARM).environment == environment
 
 
 BOX = "<box><size>0.1 0.1 0.1</size></box>"
@@ -68,14 +65,14 @@ def object_in(folder, shape=BOX, p_WL=(2.0, 0.0, 0.0)):
 
 
 @pytest.mark.slow
-def test_poses_keep_their_distance_from_another_arm(arm, tmp_path):
+def test_poses_keep_their_distance_from_another_arm(tmp_path):
     environment = dvrk.Environment(directives=OTHER_ARM.format(x=-0.27))
-    design = dvrk.design_poses(arm, 8, limits=dvrk.MotionLimits(margin=0.1, environment=environment))
-    assert first_collision(arm, design.poses, environment) is None
+    design = dvrk.design_poses(ARM, 8, limits=dvrk.MotionLimits(margin=0.1, environment=environment))
+    assert first_collision(ARM, design.poses, environment) is None
     path = tmp_path / "poses.yaml"
     design.save(path)
     assert pose_environment(path) == environment
-    save_poses(load_poses(path, arm)[:4], arm, path)  # as collect teach, which adds poses
+    save_poses(load_poses(path, ARM)[:4], ARM, path)  # as collect teach, which adds poses
     assert pose_environment(path) == environment
 
 
@@ -120,8 +117,7 @@ def test_wrong_directives_are_refused(directives, message, tmp_path, capsys):
     path, output = tmp_path / "lab.dmd.yaml", tmp_path / "out"
     path.write_text(directives)
     for command in (["excite"], ["excite", "--static", "8"], ["calibrate", "--yes"]):
-        assert main([*command, "--arm", "mtml", "--environment", str(path), "--output", str(output)]) == 2
-        line = refusal(capsys.readouterr().err)
+        line = refused(capsys, *command, "--arm", "mtml", "--environment", path, "--output", output)
         assert message in line and len(line) < 500
         assert not output.exists()
 

@@ -5,7 +5,7 @@ import re
 
 import numpy as np
 import pytest
-from command_output import messages, refusal
+from command_output import messages, refused
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, DiscreteContactApproximation, MultibodyPlant
 from pydrake.systems.analysis import Simulator
@@ -174,8 +174,7 @@ def test_compare_gc_refuses_a_file_of_another_arm(tmp_path, capsys):
     path = tmp_path / "gc.json"
     file = compensation_from_model(stock("mtml"), CompensationOptions(tolerance=0.01))
     file.save(path, "MTML", "test")
-    assert main(["export", "compare", str(path), "--arm", "mtmr"]) == 2
-    error = refusal(capsys.readouterr().err)
+    error = refused(capsys, "export", "compare", path, "--arm", "mtmr")
     assert error.startswith(f"dvrk-drake: error: {path}: the file belongs to MTML") and "model belongs to MTMR" in error
     # A file with a wrong arm name is compared. A warning shows that the name is wrong.
     file.save(path, "MTMR", "test")

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from arm_copies import copy_arm
-from command_output import assert_refused, refusal
+from command_output import assert_refused, refused
 from schema_faults import schema_fault
 
 from dvrk_drake.analysis.excitation.pose_file import PoseFile
@@ -261,11 +261,10 @@ LIMITS, COUPLED = "position_limits", "coupled_limits"
 )
 def test_implausible_numbers_in_arm_files_are_refused(file, keys, value, message, own_psm, capsys):
     path = own_psm([(file, keys, value)])
-    with pytest.raises(ArmError, match=message) as refused:
+    with pytest.raises(ArmError, match=message) as caught:
         load_arm(str(path))
-    assert "\n" not in str(refused.value) and str(path.parent) in str(refused.value)
-    assert main(["equations", "--arm", str(path)]) == 2
-    assert refusal(capsys.readouterr().err)
+    assert "\n" not in str(caught.value) and str(path.parent) in str(caught.value)
+    assert refused(capsys, "equations", "--arm", path)
 
 
 @pytest.mark.parametrize(
@@ -285,8 +284,7 @@ def test_implausible_numbers_in_arm_files_are_refused(file, keys, value, message
 def test_implausible_numbers_in_an_sdf_are_refused(element, value, message, own_psm, capsys):
     path = own_psm(sdf=(element, value))
     assert_refused(ArmError, message, load_arm, str(path))
-    assert main(["equations", "--arm", str(path)]) == 2
-    assert refusal(capsys.readouterr().err)
+    assert refused(capsys, "equations", "--arm", path)
 
 
 def test_pose_with_degrees_attribute_is_read(own_psm):
@@ -315,8 +313,7 @@ def test_implausible_numbers_in_a_model_are_refused(key, value, message, tmp_pat
     owner[int(parts[-1]) if parts[-1].isdigit() else parts[-1]] = value
     path.write_text(yaml.safe_dump(content))
     assert_refused(ModelError, rf"model\.yaml: {re.escape(key)} is \S+; {message}", IdentifiedModel.load, path)
-    assert main(["export", "--model", str(path), "--sdf", str(tmp_path / "out.sdf")]) == 2
-    assert refusal(capsys.readouterr().err)
+    assert refused(capsys, "export", "--model", path, "--sdf", tmp_path / "out.sdf")
 
 
 def test_invalid_numbers_of_an_arm_made_in_python_are_refused():

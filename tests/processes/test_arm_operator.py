@@ -220,13 +220,8 @@ class Observed:
 
     def __init__(self):
         self.operating_state = SimpleNamespace(state="ENABLED", is_homed=True, is_busy=False)
-        self.num_received, self.measurement, self.gravity_compensation, self.others, self.period = (
-            0,
-            None,
-            0.0,
-            [],
-            1_000_000,
-        )
+        self.num_received, self.measurement, self.gravity_compensation = 0, None, 0.0
+        self.others, self.period = [], 1_000_000
         self.q, self.problem, self.is_silent, self.stamp, self.step = np.zeros(7), "", False, 0, 1_000_000
         self.domain = SimpleNamespace(wait=lambda seconds: None, wait_until=lambda condition, seconds: condition())
         self.confirms, self.switches_off = True, True

@@ -15,14 +15,8 @@ from dvrk_drake.recordings.reading import detect_format, read_recording
 JOINTS, ACTUATORS = "StateDataCollection-MTML-StateTable-2025-10-06-13", "StateDataCollection-io-MTMLRead-2025-10-06-13"
 
 
-@pytest.fixture(scope="module")
-def mtm():
-    return load_arm("mtml")
-
-
-@pytest.fixture(scope="module")
-def psm():
-    return load_arm("psm")
+MTM = load_arm("mtml")
+PSM = load_arm("psm")
 
 
 def blocks(rows, joints):
@@ -33,13 +27,13 @@ def times(rows):
     return 1234.5 + 0.005 * np.arange(rows)
 
 
-def test_reads_joint_states_and_ignores_the_gripper(mtm, tmp_path):
+def test_reads_joint_states_and_ignores_the_gripper(tmp_path):
     q, qd, tau = blocks(6, 7)
-    arm = joint_state("kin/measured_js", mtm.joint_names, times(6), q, qd, tau)
+    arm = joint_state("kin/measured_js", MTM.joint_names, times(6), q, qd, tau)
     gripper = joint_state("gripper/measured_js", ["gripper"], times(6), q[:, :1], qd[:, :1], tau[:, :1])
     path = write_collection(tmp_path, JOINTS, gripper, arm)
     for given in (path, path.with_suffix(".desc")):
-        read = read_recording(given, mtm)
+        read = read_recording(given, MTM)
         np.testing.assert_array_equal(read.q, q)
         np.testing.assert_array_equal(read.qd, qd)
         np.testing.assert_array_equal(read.tau, tau)
@@ -48,82 +42,82 @@ def test_reads_joint_states_and_ignores_the_gripper(mtm, tmp_path):
         assert read.notes == (f"signal kin/measured_js of {JOINTS}.csv, in joint coordinates",)
 
 
-def test_io_tables_are_in_actuator_coordinates(mtm, tmp_path):
+def test_io_tables_are_in_actuator_coordinates(tmp_path):
     q, qd, tau = blocks(4, 7)
     path = write_collection(tmp_path, ACTUATORS, joint_state("measured_js", [], times(4), q, qd, tau))
-    read = read_recording(path, mtm)
+    read = read_recording(path, MTM)
     assert read.coordinates == "actuator"
     np.testing.assert_array_equal(read.q, q)
-    assert read_recording(path, mtm, "joint").coordinates == "joint"
+    assert read_recording(path, MTM, "joint").coordinates == "joint"
 
 
-def test_joins_the_jaw_of_a_psm(psm, tmp_path):
+def test_joins_the_jaw_of_a_psm(tmp_path):
     q, qd, tau = blocks(4, 7)
-    arm = joint_state("measured_js", psm.joint_names[:6], times(4), q[:, :6], qd[:, :6], tau[:, :6])
+    arm = joint_state("measured_js", PSM.joint_names[:6], times(4), q[:, :6], qd[:, :6], tau[:, :6])
     jaw = joint_state("jaw/measured_js", ["jaw"], times(4), q[:, 6:], qd[:, 6:], tau[:, 6:])
     path = write_collection(tmp_path, JOINTS, arm, jaw)
-    np.testing.assert_array_equal(read_recording(path, psm).q, q)
+    np.testing.assert_array_equal(read_recording(path, PSM).q, q)
     path = write_collection(tmp_path, JOINTS, arm)
-    assert_refused(r"PSM also needs jaw\. Record jaw/measured_js as well", read_recording, path, psm)
+    assert_refused(r"PSM also needs jaw\. Record jaw/measured_js as well", read_recording, path, PSM)
 
 
-def test_omits_invalid_and_repeated_rows(mtm, tmp_path):
+def test_omits_invalid_and_repeated_rows(tmp_path):
     q, qd, tau = blocks(8, 7)
     t, valid = times(8), np.ones(8)
     t[4], valid[0] = t[3], 0
-    path = write_collection(tmp_path, JOINTS, joint_state("measured_js", mtm.joint_names, t, q, qd, tau, valid))
-    read = read_recording(path, mtm)
+    path = write_collection(tmp_path, JOINTS, joint_state("measured_js", MTM.joint_names, t, q, qd, tau, valid))
+    read = read_recording(path, MTM)
     np.testing.assert_array_equal(read.lines, [2, 3, 4, 6, 7, 8])
     assert [note.partition(": ")[2] for note in read.notes[:2]] == ["marked invalid", "same time as another one"]
 
 
-def test_chooses_a_signal(mtm, tmp_path):
+def test_chooses_a_signal(tmp_path):
     q, qd, tau = blocks(4, 7)
-    first = joint_state("measured_js", mtm.joint_names, times(4), q, qd, tau)
-    second = joint_state("kin/measured_js", mtm.joint_names, times(4), 2 * q, qd, tau)
+    first = joint_state("measured_js", MTM.joint_names, times(4), q, qd, tau)
+    second = joint_state("kin/measured_js", MTM.joint_names, times(4), 2 * q, qd, tau)
     path = write_collection(tmp_path, JOINTS, first, second)
     assert_refused(
-        "several signals fit. .*: measured_js, kin/measured_js. Choose one with --topic", read_recording, path, mtm
+        "several signals fit. .*: measured_js, kin/measured_js. Choose one with --topic", read_recording, path, MTM
     )
-    np.testing.assert_array_equal(read_recording(path, mtm, topic="kin/measured_js").q, 2 * q)
-    assert_refused("has no signal other. Signals", read_recording, path, mtm, topic="other")
+    np.testing.assert_array_equal(read_recording(path, MTM, topic="kin/measured_js").q, 2 * q)
+    assert_refused("has no signal other. Signals", read_recording, path, MTM, topic="other")
 
 
-def test_faults_are_refused(mtm, psm, tmp_path):
+def test_faults_are_refused(tmp_path):
     q, qd, tau = blocks(4, 7)
-    signal = joint_state("measured_js", mtm.joint_names, times(4), q, qd, tau)
+    signal = joint_state("measured_js", MTM.joint_names, times(4), q, qd, tau)
     path = write_collection(tmp_path, JOINTS, signal)
     assert_refused(r"needs the arm .*--arm", read_recording, path)
-    assert_refused("has the joints outer_yaw.*PSM also needs yaw.*Check --arm", read_recording, path, psm)
-    still = joint_state("measured_js", mtm.joint_names, np.ones(4), q, qd, tau)
+    assert_refused("has the joints outer_yaw.*PSM also needs yaw.*Check --arm", read_recording, path, PSM)
+    still = joint_state("measured_js", MTM.joint_names, np.ones(4), q, qd, tau)
     assert_refused(
         "the times do not increase in 3 of 4 rows of measured_js",
         read_recording,
         write_collection(tmp_path, JOINTS, still),
-        mtm,
+        MTM,
     )
     tau[2, 6] = np.nan
-    bad = write_collection(tmp_path, JOINTS, joint_state("measured_js", mtm.joint_names, times(4), q, qd, tau))
-    assert_refused(r", line 3: measured_js\.Effort\[6\] is nan; only finite", read_recording, bad, mtm)
+    bad = write_collection(tmp_path, JOINTS, joint_state("measured_js", MTM.joint_names, times(4), q, qd, tau))
+    assert_refused(r", line 3: measured_js\.Effort\[6\] is nan; only finite", read_recording, bad, MTM)
     path = write_collection(tmp_path, JOINTS, signal)
     path.write_text(path.read_text()[:-30])
-    assert_refused(r", line 4: the row has \d+ cells, .*\.desc has 36", read_recording, path, mtm)
+    assert_refused(r", line 4: the row has \d+ cells, .*\.desc has 36", read_recording, path, MTM)
     path.with_suffix(".desc").write_text("a\nb\nCSV\n,\n3\n")
-    assert_refused("not a complete description", read_recording, path, mtm)
+    assert_refused("not a complete description", read_recording, path, MTM)
     path.with_suffix(".desc").unlink()
-    assert_refused(r"need their description StateDataCollection.*\.desc", read_recording, path, mtm)
+    assert_refused(r"need their description StateDataCollection.*\.desc", read_recording, path, MTM)
 
 
-def test_a_clock_that_was_set_and_missing_columns_are_refused(mtm, tmp_path):
+def test_a_clock_that_was_set_and_missing_columns_are_refused(tmp_path):
     q, qd, tau = blocks(6, 7)
     t = times(6)
     t[4:] -= 2.0
-    path = write_collection(tmp_path, JOINTS, joint_state("measured_js", mtm.joint_names, t, q, qd, tau))
-    assert_refused(r"the time of line 5 is 1\.99\d* s before that of line 4", read_recording, path, mtm)
-    path = write_collection(tmp_path, JOINTS, joint_state("measured_js", mtm.joint_names, times(6), q, qd, tau))
+    path = write_collection(tmp_path, JOINTS, joint_state("measured_js", MTM.joint_names, t, q, qd, tau))
+    assert_refused(r"the time of line 5 is 1\.99\d* s before that of line 4", read_recording, path, MTM)
+    path = write_collection(tmp_path, JOINTS, joint_state("measured_js", MTM.joint_names, times(6), q, qd, tau))
     description = path.with_suffix(".desc")
     description.write_text(description.read_text().replace("measured_js.Valid:", "measured_js.Other:"))
-    assert_refused(r"has no column measured_js\.Valid", read_recording, path, mtm)
+    assert_refused(r"has no column measured_js\.Valid", read_recording, path, MTM)
 
 
 # LeRobot data sets: joints by name, gaps between episodes, and one line for what cannot be read.

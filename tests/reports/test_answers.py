@@ -104,15 +104,8 @@ def demonstrated(console, verbose):
     identified, validation = poses()
     t = np.arange(3.0)
     q = np.outer(t, np.ones(7))
-    result = DemoResult(
-        arm=identified.model.arm,
-        identification=identified,
-        fresh=validation,
-        fresh_nominal=validation,
-        time=t,
-        identified=0.005 * q,
-        nominal=0.5 * q,
-    )
+    arm, shown = identified.model.arm, {"time": t, "identified": 0.005 * q, "nominal": 0.5 * q}
+    result = DemoResult(arm=arm, identification=identified, fresh=validation, fresh_nominal=validation, **shown)
     print_page(console, demo.demo_page(result, Path("demo_output")), verbose=verbose)
 
 

@@ -4,6 +4,8 @@ import re
 
 import pytest
 
+from dvrk_drake.cli import main
+
 #: Line of progress if stderr is not a terminal, e.g. "1 of 3: reading", or "simulating" for a single step.
 STEP = re.compile(r"\d+ of \d+: .+|[a-z][^:]*")
 
@@ -18,6 +20,12 @@ def refusal(errors):
     (line,) = messages(errors)
     assert line.startswith("dvrk-drake: error: "), line
     return line
+
+
+def refused(capsys, *words):
+    """Runs a command that must fail with exit code 2. Returns its only message."""
+    assert main([str(word) for word in words]) == 2
+    return refusal(capsys.readouterr().err)
 
 
 def assert_refused(error, message, call, *arguments, **options):

@@ -204,12 +204,6 @@ def test_gravity_mode_ignores_desired_state():
     assert bench.output("fault") == [0.0]
 
 
-def test_feedforward_scale_scales_gravity():
-    joints = [dataclasses.replace(joint, feedforward_scale=0.25) for joint in MODEL.joints]
-    bench = Bench(model=dataclasses.replace(MODEL, joints=joints), mode="gravity", effort_limits=UNLIMITED)
-    np.testing.assert_allclose(bench.initialize(POSES[0]), 0.25 * MODEL.holding_torque(POSES[0]), atol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

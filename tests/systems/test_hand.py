@@ -91,18 +91,6 @@ def test_limited_force_and_torque_keep_direction():
         np.testing.assert_allclose(limited[part], limit * way[part] / np.linalg.norm(way[part]), rtol=1e-3, atol=1e-4)
 
 
-@pytest.mark.parametrize("time_step", [1e-3, 1e-2])
-def test_force_and_torque_are_limited(time_step):
-    generator = np.random.default_rng(0)
-    hand = Hand(ARM, time_step=time_step)
-    for _ in range(20):
-        q = ARM.sample_poses(1, generator)[0]
-        far = moved(ArmFrame(ARM, "dh_7").pose(q), generator.normal(size=3), generator.normal(size=3))
-        F = evaluate(hand, q, generator.normal(size=7), far)[1]
-        assert np.linalg.norm(F[:3]) <= 0.6 * (1 + 1e-12)
-        assert np.linalg.norm(F[3:]) <= 20.0 * (1 + 1e-12)
-
-
 def test_no_force_without_finite_desired_pose():
     X = ArmFrame(ARM, "dh_7").pose(Q + 0.1)
     bad = Q.copy()

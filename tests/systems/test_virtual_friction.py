@@ -140,7 +140,7 @@ def test_one_encoder_count_changes_the_effort_little():
         assert np.all(np.abs(added) <= 0.4 * ARM.dry_friction())  # the spring and the damping
 
 
-def test_a_joint_at_rest_may_alternate_between_two_encoder_counts():
+def test_a_joint_at_rest_may_alternate_between_counts():
     guided, counts = Guided(IdentifiedModel.from_arm(WITH_ENCODER), kd=0.0), WITH_ENCODER.encoder_counts()
     guided.rest(seconds=PLAY_START + PLAY_TIME + REST_TIME)
     first = guided.step(Q + counts)

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from command_output import refusal
+from command_output import refused
 from motions import fourier_motion, friction_everywhere, recorded, true_dynamics
 from recordings import csv_block
 
@@ -133,7 +133,6 @@ def test_motion_below_a_table_is_refused():
     [
         ({"harmonics": 1}, "harmonics is 1; allowed: 2 to 20"),
         ({"duration": 0.5}, "period is 0.5; allowed: 1 to 600"),
-        ({"duration": float("nan")}, "period is nan; allowed: 1 to 600"),
         ({"duration": 3.0, "period": 5.0}, "duration is 3; allowed: 5 to 36000"),
         ({"starts": 0}, "starts is 0"),
         ({"limits": MotionLimits(effort=0.05)}, "the dry friction exceeds 5 % of the effort limit"),
@@ -162,14 +161,11 @@ def test_command_writes_the_motion(tmp_path, monkeypatch, capsys):
         (["--output", "m.yaml"], "m.yaml already exists"),
         (["--output", "n.yaml", "--position", "elbow_pitch=0"], "--position elbow_pitch=0: allowed: JOINT=LOWER:UPPER"),
         (["--output", "n.yaml", "--csv", "n.yaml"], "n.yaml"),
-        (["--output", "n.yaml", "--csv", "n.csv", "--rate", "0"], "--rate is 0; allowed: 1 to 10000"),
-        (["--output", "n.yaml", "--effort", "2"], "effort is 2; allowed: 0.05..1"),
         (["--output", "n.yaml"], "--rate requires --csv"),
         (["--output", "n.yaml", "--position", "outer_yaw=0:1", "outer_yaw=0:0.5"], "outer_yaw is given twice"),
     ):
         rate = ["--rate", "100"] if "--rate requires" in message else []
-        assert main(["excite", "--arm", "mtmr", *options, *rate, *short]) == 2
-        assert message in refusal(capsys.readouterr().err)
+        assert message in refused(capsys, "excite", "--arm", "mtmr", *options, *rate, *short)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["m.csv", "m.yaml"]
 
 
@@ -274,6 +270,5 @@ def test_models_of_other_arms_are_rejected(tmp_path, monkeypatch, capsys):
         (["--arm", "psm", "--model", "none.yaml"], "none.yaml"),
         (["--arm", "psm", "--model", "psm.yaml", "--gravity", "0", "0", "-9.81"], "--gravity cannot be used with"),
     ):
-        assert main(["excite", *options, "--output", "motion.yaml"]) == 2
-        assert message in refusal(capsys.readouterr().err)
+        assert message in refused(capsys, "excite", *options, "--output", "motion.yaml")
     assert [path.name for path in tmp_path.iterdir()] == ["psm.yaml"]

@@ -4,7 +4,7 @@ from itertools import pairwise, permutations
 
 import numpy as np
 import pytest
-from command_output import refusal
+from command_output import refused
 
 import dvrk_drake as dvrk
 from dvrk_drake.analysis.excitation import static_poses
@@ -186,14 +186,9 @@ def test_command_writes_a_pose_file(tmp_path, monkeypatch, capsys):
     for options, message in (
         (["--output", "p.yaml"], "p.yaml already exists"),
         (["--output", "n.yaml", "--csv", "n.csv"], "--csv cannot be used with --static"),
-        (["--output", "n.yaml", "--rate", "200"], "--rate cannot be used with --static"),
         (["--output", "n.yaml", "--period", "15", "--starts", "4"], "--period and --starts cannot be used with"),
-        (["--output", "n.yaml", "--duration", "30", "--harmonics", "3"], "--duration and --harmonics cannot be used"),
         (["--output", "n.yaml", "--traverse-time", "2"], "--traverse-time cannot be used with --static"),
-        (["--output", "n.yaml", "--margin", "0.5"], "margin is 0.5; allowed: 0..0.4"),
     ):
-        assert main([*command, *options]) == 2
-        assert message in refusal(capsys.readouterr().err)
-    assert main([*command[:4], "3", "--output", "n.yaml"]) == 2
-    assert "the number of poses is 3; allowed: 8 to 300" in refusal(capsys.readouterr().err)
+        assert message in refused(capsys, *command, *options)
+    assert "the number of poses is 3; allowed: 8 to 300" in refused(capsys, *command[:4], "3", "--output", "n.yaml")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["p.yaml"]

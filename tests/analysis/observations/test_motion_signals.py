@@ -146,7 +146,6 @@ def test_parts_of_the_efforts_add_up_to_the_model(grid):
 
 RATE = 200.0
 FREQUENCIES = np.array([0.31, 0.53, 0.83])  # [Hz]
-INNER = slice(200, -200)
 
 
 def oscillation(t):

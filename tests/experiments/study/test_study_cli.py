@@ -5,7 +5,7 @@ import sys
 
 import numpy as np
 import pytest
-from command_output import refusal
+from command_output import refusal, refused
 from repository import ROOT
 
 from dvrk_drake.cli import main
@@ -72,8 +72,7 @@ def test_rejects_invalid_files_and_outputs(study, tmp_path, capsys):
         (tmp_path / "folder.csv", "is not a regular file"),
         (tmp_path / "r.txt", "must end in .csv"),
     ):
-        assert main(["simulate", "study", str(study), "--output", str(output)]) == 2
-        assert message in refusal(capsys.readouterr().err)
+        assert message in refused(capsys, "simulate", "study", study, "--output", output)
     assert study.read_text() == STUDY
 
 
@@ -87,18 +86,9 @@ def test_rejects_invalid_schedulers(study, capsys):
         "import sys, dvrk_drake.cli, dvrk_drake.experiments.study.study as study; study.TIMEOUT = 0.3;"
         "sys.exit(dvrk_drake.cli.main(sys.argv[1:]))"
     )
-    command = [
-        sys.executable,
-        "-c",
-        code,
-        "simulate",
-        "study",
-        str(study),
-        "--scheduler",
-        "tcp://127.0.0.1:1",
-        "--output",
-    ]
-    done = subprocess.run([*command, str(study.parent / "new.csv")], check=False, capture_output=True, text=True)
+    options = ["--scheduler", "tcp://127.0.0.1:1", "--output", study.parent / "new.csv"]
+    command = [sys.executable, "-c", code, "simulate", "study", study, *options]
+    done = subprocess.run(command, check=False, capture_output=True, text=True)
     assert done.returncode == 2 and "no Dask scheduler answers at this address" in refusal(done.stderr)
 
 

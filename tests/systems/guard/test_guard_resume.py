@@ -351,6 +351,18 @@ def test_measurements_have_wall_clock_times():
     assert clock.time_of(11_999, 7) == clock.now() - 7
 
 
+def test_wall_times_are_forgotten_if_the_arm_clock_goes_back():
+    """Measurements have the same times as earlier ones, but they are recent."""
+    bench = WallBench().started()
+    bench.utime -= 200 * MS
+    bench.stall(300)
+    bench.step()
+    assert bench.guard.fault_code == Status.FAULT_CLOCK
+    for reset in (False, True):
+        bench.run(Command.HOLD, 1, reset_fault=reset)
+    bench.started()
+
+
 def test_stall_while_starting_needs_no_resume():
     bench = WallBench()
     bench.run(Command.EFFORT, 200)

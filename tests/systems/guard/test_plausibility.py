@@ -339,6 +339,16 @@ def test_effort_in_hold_is_not_compared():
         assert sensors.move(np.zeros(N), ticks=1)[0] == ""
 
 
+def test_efforts_that_are_zero_now_and_then_are_plausible():
+    """The time of the measured zeros restarts with each measured effort."""
+    sensors = Sensors()
+    sensors.commanded = 0.05 * LIMIT
+    for _ in range(10):
+        for effort, ticks in ((0.0, round(0.7 * SETTINGS.zero_time / MS)), (0.04, 1)):
+            sensors.effort = effort * LIMIT
+            assert sensors.move(COUNTS / MS, ticks=ticks)[0] == ""
+
+
 def test_compensated_gravity_is_not_unexplained():
     model = Weightless()
     model.gravity_effort = lambda q: 3 * LIMIT * np.sin(10 * q)
@@ -373,6 +383,17 @@ def test_prismatic_joints_use_a_tenth_of_the_tolerance():
     checks = Sensors(PSM)
     checks.q = checks.q + 0.0012 * np.eye(7)[2]
     assert checks.measure() == f"{PSM.joint_names[2]}: the position jumps"
+
+
+def test_frozen_prismatic_joint_is_found():
+    count = PSM.encoder_counts()[2]
+    share = SETTINGS.frozen_effort + count / (0.1 * SETTINGS.frozen_deflection)
+    for factor, found in ((0.999, False), (1.001, True)):
+        sensors = Sensors(PSM)
+        sensors.move(np.zeros(N), ticks=1000)
+        sensors.effort = unit(2, factor * share * PSM.effort_limits[2])
+        fault, _ = sensors.move(np.zeros(N), ticks=500)
+        assert fault == found * f"{PSM.joint_names[2]}: the position does not change although the effort does"
 
 
 # In the guard
