@@ -1,6 +1,6 @@
 """Measures the errors of the estimated force at the tip of a simulated arm, and of two simpler methods.
 
-    python benchmarks/external_force.py [--arm psm] [--contacts 200] [--free-minutes 30] [--bandwidth 30] [--folder F]
+    python benchmarks/external_force.py [--arm psm] [--contacts 200] [--free-minutes 30] [--bandwidth 40] [--folder F]
 
 The simulated arm has all effects of its file: friction, springs, encoders, noise, delays. Its model is identified from
 one designed motion of 30 s. Then the arm follows another, random motion, while random forces act on its tip: 1 s each,
@@ -44,7 +44,7 @@ from dvrk_drake.analysis.identification import identify
 from dvrk_drake.dynamics.contact import Contact
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.kinematics import ArmFrame
-from dvrk_drake.dynamics.momentum_observer import MomentumObserver
+from dvrk_drake.dynamics.momentum_observer import BANDWIDTH, MomentumObserver
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effect_kinds import POSITION_KINDS
@@ -251,7 +251,7 @@ def main() -> int:
     parser.add_argument(
         "--free-minutes", type=float, default=30.0, help="simulated minutes without a force; default: %(default)s"
     )
-    parser.add_argument("--bandwidth", type=float, default=30.0, help="bandwidth [rad/s]; default: %(default)s")
+    parser.add_argument("--bandwidth", type=float, default=BANDWIDTH, help="bandwidth [rad/s]; default: %(default)s")
     parser.add_argument("--folder", type=Path, help="folder that keeps the recordings and the model")
     options = parser.parse_args()
     arm, bandwidth = load_arm(options.arm), options.bandwidth

@@ -1,4 +1,4 @@
-"""Bounds the dry friction of an arm where the model does not determine it: at rest, and at the start of a motion."""
+"""Bounds the dry friction of an arm where the model does not determine it: at rest, at the start, after a reversal."""
 
 from __future__ import annotations
 
@@ -15,18 +15,23 @@ REST_TIME = 0.25
 #: Smallest travel in `REST_TIME` that is a motion [rad], [m]. The presliding travel of gears is shorter, and less than
 #: the noise of a measured velocity.
 MIN_TRAVEL = 5e-4, 1e-4
+#: Standard deviation of the effort of a presliding element after a reversal, as a share of its coefficient. A model has
+#: elements on a grid of travels with a ratio of about 10/3. An element whose travel is between two of them differs from
+#: their best combination by this share (RMS until both slide, over all travels).
+REVERSAL_SHARE = 0.22
 
 
 class DryFrictionBound:
     """Standard deviation of the dry friction along the coordinates of an arm's drive.
 
-    While a coordinate moves, or turns back, the model determines its dry friction. At rest, friction balances any
-    effort between minus and plus the sum of its coefficients. At the start, the deflection of a presliding element is
-    unknown, until the coordinate has moved over twice its presliding travel. The standard deviation is that of a
-    uniform distribution in these bounds.
+    While a coordinate slides, the model determines its dry friction. At rest, friction balances any effort between
+    minus and plus the sum of its coefficients. At the start, the deflection of a presliding element is unknown, until
+    the coordinate has moved over twice its presliding travel. The standard deviation is that of a uniform distribution
+    in these bounds. After a reversal, it is `REVERSAL_SHARE` of the coefficient along the same distance.
 
-    A state (3 c) has three numbers for each of c coordinates: how long it has rested, from 0 in motion to 1 after
-    several times `REST_TIME`, then its smallest and its largest position since the start.
+    A state (4 c) has four numbers for each of c coordinates: how long it has rested, from 0 in motion to 1 after
+    several times `REST_TIME`, then its smallest and its largest position since the start, and the distance since the
+    last reversal, with the sign of the motion.
 
     Attributes:
         rows: Matrix (c, n) that maps joint positions to the positions of the coordinates with dry friction.
@@ -60,24 +65,26 @@ class DryFrictionBound:
         self._wiped = 2.0 * scales * has_state
 
     def start(self) -> NDArray[np.float64]:
-        """Returns the state (3 c) of an arm that may have rested for any time."""
+        """Returns the state (4 c) of an arm that may have rested for any time."""
         one = np.ones(len(self.rows))
-        return np.concatenate([one, np.inf * one, -np.inf * one])
+        return np.concatenate([one, np.inf * one, -np.inf * one, 0.0 * one])
 
     def update(self, state: NDArray[np.float64], q: NDArray[np.float64], v: NDArray[np.float64], period: float) -> None:
         """Updates a state in place with the positions q and velocities v (n,) of the joints after a period [s]."""
-        rest, low, high = state.reshape(3, -1)  # views
-        x = self.rows @ q
-        still = 1.0 - np.tanh(self.rows @ v / self._speeds) ** 2
+        rest, low, high, distance = state.reshape(4, -1)  # views
+        x, rate = self.rows @ q, self.rows @ v
+        still = 1.0 - np.tanh(rate / self._speeds) ** 2
         rest[:] = np.minimum(still, rest + min(period / REST_TIME, 1.0) * (1.0 - rest))
         np.minimum(low, x, out=low)
         np.maximum(high, x, out=high)
+        distance[:] = np.where(distance * rate < 0, 0.0, distance) + period * rate
 
     def covariance(self, states: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns the covariances (..., n, n) of the joint efforts [(N m)^2, N^2] for states (..., 3 c)."""
-        rest, low, high = np.split(states, 3, axis=-1)
-        # Elements with a known deflection count at rest, the others always.
-        is_unknown = (high - low)[..., None] < self._wiped
-        deviation = np.sum(self._deviations * np.where(is_unknown, 1.0, rest[..., None]), axis=-1)
+        """Returns the covariances (..., n, n) of the joint efforts [(N m)^2, N^2] for states (..., 4 c)."""
+        rest, low, high, distance = np.split(states, 4, axis=-1)
+        turns = np.abs(distance)[..., None] < self._wiped
+        share = np.maximum(rest[..., None], np.sqrt(3.0) * REVERSAL_SHARE * turns)
+        share[(high - low)[..., None] < self._wiped] = 1.0
+        deviation = np.sum(self._deviations * share, axis=-1)
         scaled = deviation[..., None] * self.rows
         return np.asarray(scaled.swapaxes(-1, -2) @ scaled)

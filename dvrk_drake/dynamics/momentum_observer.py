@@ -14,8 +14,8 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ControllerError, ModelError
 
 #: Default bandwidth [rad/s], for which the errors were measured (benchmarks/external_force.py). The estimate is late by
-#: 33 ms.
-BANDWIDTH = 30.0
+#: 25 ms. The delay causes most of the error of a force that changes within 0.1 s.
+BANDWIDTH = 40.0
 
 
 class MomentumObserver:
@@ -123,7 +123,8 @@ class MomentumObserver:
     def covariance(self, state: NDArray[np.float64], *, other_day: bool = True) -> NDArray[np.float64]:
         """Returns the covariance (n, n) of the external joint efforts.
 
-        It contains the errors of the model on held-out motions, and the dry friction that the model does not determine.
+        It contains the errors of the model on held-out motions, and the dry friction that the model does not determine
+        (`DryFrictionBound`).
 
         Args:
             state: State (size,).

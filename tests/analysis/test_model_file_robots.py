@@ -13,7 +13,7 @@ from dvrk_drake.analysis.estimation.motion_effects import common_delay
 from dvrk_drake.analysis.motion_identification import motion_problem
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
-from dvrk_drake.dynamics.dry_friction_bound import MIN_TRAVEL, REST_TIME, DryFrictionBound
+from dvrk_drake.dynamics.dry_friction_bound import MIN_TRAVEL, REST_TIME, REVERSAL_SHARE, DryFrictionBound
 from dvrk_drake.dynamics.physical_consistency import WIDENING, bounding_boxes
 from dvrk_drake.models.arm_files import derived_arm_file
 
@@ -62,6 +62,24 @@ def test_gears_rest_despite_noise_of_the_velocity(arm):
     for _ in range(200):
         bound.update(state, q, np.full(3, noise), 0.01)
     np.testing.assert_allclose(bound.covariance(state)[0, 0], 4.0 / 3.0, rtol=0.05, atol=0)
+
+
+def test_presliding_is_uncertain_after_a_reversal(arm):
+    travel, coefficient = 0.02, 2.0
+    model = SimpleNamespace(
+        arm=arm, effects=[ActuatorEffect("actuator.turn", "presliding", travel)], coefficients=[coefficient]
+    )
+    bound = DryFrictionBound(model)
+    state, q, turn = bound.start(), np.zeros(3), np.array([1.0, 0.0, 0.0])
+    deviations = []
+    for step in np.repeat([0.001, -0.001], 100):
+        q = q + step * turn
+        bound.update(state, q, step / 0.001 * turn, 0.001)
+        deviations.append(np.sqrt(bound.covariance(state)[0, 0]))
+    within = np.arange(2, 2 * travel / 0.001 - 1, dtype=int)  # after the start, and after the reversal
+    np.testing.assert_allclose(np.array(deviations)[within], coefficient / np.sqrt(3.0), atol=1e-9)
+    np.testing.assert_allclose(np.array(deviations)[100 + within], REVERSAL_SHARE * coefficient, atol=1e-9)
+    np.testing.assert_allclose(np.array(deviations)[[60, 99, 160, 199]], 0.0, atol=1e-9)
 
 
 def test_boxes_without_collision_shapes_are_wider(tmp_path):

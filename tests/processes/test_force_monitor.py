@@ -48,7 +48,7 @@ def test_force_is_published_in_the_axes_of_its_frame():
     last = messages[-1]
     assert (last.session_id, last.arm_name, last.frame_name) == (7, "PSM", PSM.frames.hand)
     covariance, force = np.array(last.force_covariance), np.array(last.force)
-    R_BF = ArmFrame(PSM).pose(recording.q[(last.utime - 33_000) // 1000 - 1]).rotation()  # 33 ms: delay
+    R_BF = ArmFrame(PSM).pose(recording.q[(last.utime - 25_000) // 1000 - 1]).rotation()  # 25 ms: delay
     np.testing.assert_allclose(force, R_BF.inverse() @ FORCE, atol=0.1)
     np.testing.assert_allclose(covariance, covariance.T, atol=1e-9)
 
