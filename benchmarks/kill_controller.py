@@ -43,7 +43,7 @@ from dvrk_drake.models.lcm_messages import describe_state
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.pace import make_realtime, settle_memory
 from dvrk_drake.processes.simulated_arm import SimulatedArm, monotonic_utime, start_pose, stop_on_signals
-from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.driver import DvrkDriver
 from dvrk_drake.systems.lcm.lcm_network import open_lcm
 
 CONDITIONS = {"alone": 0, "two busy processes": 2}

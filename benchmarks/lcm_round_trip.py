@@ -46,7 +46,7 @@ from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.lcm_messages import command_channel, status_channel
 from dvrk_drake.processes.pace import Pace, make_realtime, settle_memory
 from dvrk_drake.processes.simulated_arm import SimulatedArm, start_pose
-from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.driver import DvrkDriver
 from dvrk_drake.systems.lcm.lcm_network import handle_message, listen, open_lcm
 
 ARM = load_arm("mtml")

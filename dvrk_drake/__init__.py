@@ -47,12 +47,11 @@ if TYPE_CHECKING:
     from dvrk_drake.systems.arm_station import ArmStation
     from dvrk_drake.systems.arm_view.page import start_meshcat
     from dvrk_drake.systems.closed_loop import add_closed_loop
+    from dvrk_drake.systems.driver import CrtkDriver, DvrkDriver
     from dvrk_drake.systems.external_force_estimator import ExternalForceEstimator
     from dvrk_drake.systems.force_feedback import ForceFeedback
     from dvrk_drake.systems.gravity_pid_controller import GravityPidController
     from dvrk_drake.systems.hardware_arm_station import HardwareArmStation
-    from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
-    from dvrk_drake.systems.ros.crtk_driver import CrtkDriver
     from dvrk_drake.systems.station import Station
     from dvrk_drake.systems.station_config import load_station_config
     from dvrk_drake.systems.teleoperated_arms import TeleoperatedArms, Wall
@@ -64,10 +63,10 @@ _MODULES = {
     "ArmStation": "systems.arm_station",
     "CollectionSettings": "processes.collector",
     "Contact": "dynamics.contact",
-    "CrtkDriver": "systems.ros.crtk_driver",
+    "CrtkDriver": "systems.driver",
     "Dialog": "processes.arm_session",
     "DvrkDrakeError": "errors",
-    "DvrkDriver": "systems.lcm.dvrk_driver",
+    "DvrkDriver": "systems.driver",
     "Environment": "models.environment",
     "ExternalForceEstimator": "systems.external_force_estimator",
     "ForceFeedback": "systems.force_feedback",

@@ -89,17 +89,17 @@ def deadman(*, arm: options.Arm, topic: options.RosTopic = None, domain: options
     """
     from dvrk_drake.processes.simulated_arm import stop_on_signals
     from dvrk_drake.systems.ros.deadman import Deadman, request_priority
+    from dvrk_drake.systems.ros.discovery import find_topic
     from dvrk_drake.systems.ros.open_domain import open_ros_domain
 
     priority = request_priority()  # the threads of DDS inherit it
     ros = open_ros_domain(domain)
-    from dvrk_drake.systems.ros.crtk_client import find_arm
 
     def report(line: str) -> None:
         with contextlib.suppress(OSError):
             print(line, flush=True)
 
-    namespace = find_arm(ros, dvrk.load_arm(arm), topic, report=report)
+    namespace = find_topic(ros, dvrk.load_arm(arm), topic, report=report).rpartition("/")[0]
     monitor = Deadman(ros, namespace, report)
     stopped = stop_on_signals()
     # A closed terminal must not end this process.

@@ -60,7 +60,7 @@ def teleop(
     from dvrk_drake.experiments.demo.teleoperation_scene import start_scene
     from dvrk_drake.models.files import atomic_write
     from dvrk_drake.reports.demo import teleoperation_page
-    from dvrk_drake.systems.arm_view.force_arrow import FORCE_COLOR, FORCE_SCALE
+    from dvrk_drake.systems.arm_view.efforts import FORCE_COLOR, FORCE_SCALE
     from dvrk_drake.systems.arm_view.page import page_html
 
     if output is None:

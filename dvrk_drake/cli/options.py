@@ -115,14 +115,23 @@ def gravity_vector(_: object, tokens: Sequence[Token]) -> tuple[float, float, fl
     words, keywords = [token.value for token in tokens], {token.keyword or "" for token in tokens}
     if len(keywords) > 1:
         raise ValueError("--gravity and --mount exclude each other; give one of them")
-    is_file = keywords == {"--mount"} and len(words) == 1 and words[0].lower().endswith(".json")
-    if keywords == {"--mount"} and len(words) == 1 and words[0].startswith("/") and not is_file:
-        return _topic_gravity(words[0])
+    is_mount, is_file = keywords == {"--mount"}, len(words) == 1 and words[0].lower().endswith(".json")
     try:
-        numbers = [_mounting_pitch(words[0])] if is_file else [float(word) for word in words]
-    except ValueError as error:
-        raise ValueError(str(error) if is_file else f"{min(keywords)}: {' '.join(words)!r} are not numbers") from None
-    if keywords == {"--mount"}:
+        if is_mount and is_file:
+            from dvrk_drake.export.dvrk_psm_gravity_compensation import configured_pitch
+
+            numbers = [configured_pitch(words[0])]
+        elif is_mount and len(words) == 1 and words[0].startswith("/"):
+            from dvrk_drake.systems.ros.mount_topic import topic_gravity
+
+            return topic_gravity(words[0])
+        else:
+            numbers = [float(word) for word in words]
+    except DvrkDrakeError as error:
+        raise ValueError(str(error)) from None
+    except ValueError:
+        raise ValueError(f"{min(keywords)}: {' '.join(words)!r} are not numbers") from None
+    if is_mount:
         from dvrk_drake.models.mounting import mount_gravity
 
         if len(numbers) not in (1, 3) or not all(abs(x) <= 2 * math.pi for x in numbers):
@@ -131,25 +140,6 @@ def gravity_vector(_: object, tokens: Sequence[Token]) -> tuple[float, float, fl
     if len(numbers) != 3:
         raise ValueError("--gravity needs three numbers [m/s^2]")
     return numbers[0], numbers[1], numbers[2]
-
-
-def _topic_gravity(topic: str) -> tuple[float, float, float]:
-    from dvrk_drake.systems.ros.mount_topic import topic_gravity
-
-    try:
-        return topic_gravity(topic)
-    except DvrkDrakeError as error:
-        raise ValueError(str(error)) from None
-
-
-def _mounting_pitch(path: str) -> float:
-    """Returns `mounting_pitch` of a configuration of the dVRK. Raises ValueError if it cannot be read."""
-    from dvrk_drake.export.dvrk_psm_gravity_compensation import configured_pitch
-
-    try:
-        return configured_pitch(path)
-    except DvrkDrakeError as error:
-        raise ValueError(str(error)) from None
 
 
 GRAVITY_HELP = (

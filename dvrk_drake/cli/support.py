@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from dvrk_drake.models.environment import Environment
     from dvrk_drake.models.lcm_messages import MessageKey
     from dvrk_drake.reports.page import Page
-    from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+    from dvrk_drake.systems.driver import DvrkDriver
 
 
 def import_interruptibly() -> None:
@@ -258,7 +258,7 @@ def driver_configuration(path: str | None, key: str | None, lcm_url: str) -> Dvr
         DvrkDrakeError: The configuration is not valid, or the LCM network cannot be used.
     """
     from dvrk_drake.processes.simulated_arm import load_driver
-    from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+    from dvrk_drake.systems.driver import DvrkDriver
     from dvrk_drake.systems.lcm.lcm_network import open_lcm
 
     driver = DvrkDriver() if path is None else load_driver(path)

@@ -24,12 +24,12 @@ from dvrk_drake.processes.arm_operator import reset_fault
 from dvrk_drake.processes.control import FIRST_WAIT, SILENCE, StatusHandler, control, first_status
 from dvrk_drake.processes.force_monitor import ForceMonitor
 from dvrk_drake.processes.live_status import LiveStatus
+from dvrk_drake.systems.driver import CrtkDriver
 from dvrk_drake.systems.friction_compensator import FrictionCompensator
 from dvrk_drake.systems.gravity_pid_controller import Mode
 from dvrk_drake.systems.guard.settings import GuardSettings
 from dvrk_drake.systems.lcm.arm_link import ArmLink, LcmArmLink
 from dvrk_drake.systems.lcm.lcm_network import open_lcm
-from dvrk_drake.systems.ros.crtk_driver import CrtkDriver
 from dvrk_drake.systems.ros.open_domain import require_cyclonedds
 
 if TYPE_CHECKING:

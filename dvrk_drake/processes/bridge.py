@@ -13,7 +13,7 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_force
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import command_channel, force_channel, status_channel
 from dvrk_drake.processes.force_monitor import ForceMonitor
-from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.driver import DvrkDriver
 from dvrk_drake.systems.lcm.lcm_network import handle_message
 from dvrk_drake.systems.ros.open_domain import require_cyclonedds
 
@@ -45,7 +45,7 @@ def run_bridge(
     Args:
         arm: Arm on ROS 2.
         driver: Configuration of the guard and of the LCM network; `driver.status_period` is not used.
-        topic: Topic measured_js of the arm or its namespace; see `find_arm`.
+        topic: Topic measured_js of the arm or its namespace; see `find_topic`.
         domain: ROS domain. None: the environment variable ROS_DOMAIN_ID, or else 0.
         polls: Whether to poll for messages while a controller commands the arm. The delay decreases, but the bridge
             uses a processor core.

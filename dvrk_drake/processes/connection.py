@@ -30,6 +30,7 @@ from dvrk_drake.systems.friction_compensator import FrictionCompensator
 from dvrk_drake.systems.gravity_pid_controller import Mode
 from dvrk_drake.systems.guard.settings import GuardSettings
 from dvrk_drake.systems.lcm.lcm_network import open_lcm
+from dvrk_drake.systems.ros.discovery import find_topic
 from dvrk_drake.systems.ros.open_domain import open_ros_domain
 
 if TYPE_CHECKING:
@@ -273,11 +274,12 @@ class ArmConnection(ArmSession):
     def _observer(self) -> CrtkObserver:
         """Finds the arm on ROS 2. The caller closes the observer."""
         domain = open_ros_domain(self.domain)
-        from dvrk_drake.systems.ros.crtk_client import CrtkObserver, find_arm
+        from dvrk_drake.systems.ros.crtk_client import CrtkObserver
 
         try:
-            namespace = find_arm(domain, self.arm, self.topic, report=self.dialog.report, stopped=self.dialog.stopped)
-            return CrtkObserver(domain, self.arm, namespace)
+            dialog = self.dialog
+            topic = find_topic(domain, self.arm, self.topic, report=dialog.report, stopped=dialog.stopped)
+            return CrtkObserver(domain, self.arm, topic.rpartition("/")[0])
         except BaseException:
             domain.close()
             raise

@@ -11,7 +11,7 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_force, lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import decode, describe_state, force_channel
 from dvrk_drake.systems.arm_view.arm_view import ArmView
-from dvrk_drake.systems.arm_view.force_arrow import DrawnForce
+from dvrk_drake.systems.arm_view.efforts import DrawnForce
 from dvrk_drake.systems.lcm.arm_link import ArmLink
 from dvrk_drake.systems.lcm.lcm_network import handle_message
 

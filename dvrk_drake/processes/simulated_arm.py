@@ -23,12 +23,11 @@ from dvrk_drake.models.lcm_messages import command_channel, describe_state, stat
 from dvrk_drake.models.typed_yaml import load_typed_yaml
 from dvrk_drake.processes.pace import Pace
 from dvrk_drake.systems.arm_station import ArmStation
+from dvrk_drake.systems.driver import CrtkDriver, DvrkDriver
 from dvrk_drake.systems.guard.command_guard import CommandGuard
-from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.lcm_network import handle_message, listen
 from dvrk_drake.systems.lcm.sim_dvrk_driver import apply_driver_config
 from dvrk_drake.systems.ros.crtk_arm_state import CrtkCommand
-from dvrk_drake.systems.ros.crtk_driver import CrtkDriver
 from dvrk_drake.systems.ros.open_domain import open_ros_domain
 from dvrk_drake.systems.ros.sim_crtk_driver import PERIOD, apply_crtk_driver_config
 

@@ -98,7 +98,7 @@ def _scene(result: ExternalForce) -> Scene:
     x = _x(result)
 
     def html() -> str:
-        from dvrk_drake.systems.arm_view.force_arrow import DrawnForce  # slow to import
+        from dvrk_drake.systems.arm_view.efforts import DrawnForce  # slow to import
 
         rows = np.unique(np.searchsorted(x, frame_times(float(x[0]), float(x[-1]))))
         forces, contact = [], result.contact

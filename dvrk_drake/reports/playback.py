@@ -12,7 +12,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.reports.colours import REFERENCE
 
 if TYPE_CHECKING:
-    from dvrk_drake.systems.arm_view.force_arrow import DrawnForce
+    from dvrk_drake.systems.arm_view.efforts import DrawnForce
 
 #: Largest rate [Hz] and largest number of key frames. Meshcat interpolates between key frames.
 MAX_RATE, MAX_FRAMES = 30.0, 400
@@ -60,7 +60,7 @@ def playback(
     from pydrake.geometry import MeshcatAnimation, Rgba
 
     from dvrk_drake.systems.arm_view.drawn_arm import DrawnArm
-    from dvrk_drake.systems.arm_view.force_arrow import FORCE_COLOR, FORCE_SCALE
+    from dvrk_drake.systems.arm_view.efforts import FORCE_COLOR, FORCE_SCALE
     from dvrk_drake.systems.arm_view.overlay import ArmOverlay
     from dvrk_drake.systems.arm_view.page import page_html, start_meshcat
 

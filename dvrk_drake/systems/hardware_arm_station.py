@@ -12,10 +12,9 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.systems.driver import CrtkDriver, DvrkDriver
 from dvrk_drake.systems.lcm.arm_link import ArmLink, DrakeLcmArmLink, LcmArmLink
-from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.messages import draw_id, make_command
-from dvrk_drake.systems.ros.crtk_driver import CrtkDriver
 from dvrk_drake.systems.ros.open_domain import require_cyclonedds
 
 #: Measured values: name of the port, and fields of the status in their order.

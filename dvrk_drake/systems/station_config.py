@@ -26,9 +26,8 @@ from dvrk_drake.models.loop_closure import Closure
 from dvrk_drake.models.ranges import number_fault, within
 from dvrk_drake.models.typed_yaml import load_yaml, typed_content
 from dvrk_drake.systems.arm_station import arm_plant_config
+from dvrk_drake.systems.driver import CrtkDriver, DvrkDriver
 from dvrk_drake.systems.ideal_drive import plant_config_fault
-from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
-from dvrk_drake.systems.ros.crtk_driver import CrtkDriver
 
 
 @dataclass

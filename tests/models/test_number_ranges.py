@@ -38,10 +38,9 @@ from dvrk_drake.models.effects_schema import ArmEffects, FrictionEffect
 from dvrk_drake.models.ranges import RANGE, Range, number_fault, within
 from dvrk_drake.models.sdf_model import _RANGES
 from dvrk_drake.processes.collector import CollectionSettings
+from dvrk_drake.systems.driver import CrtkDriver, DvrkDriver
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 from dvrk_drake.systems.hand import Grip
-from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
-from dvrk_drake.systems.ros.crtk_driver import CrtkDriver
 from dvrk_drake.systems.station_config import load_station_config
 
 #: Schemas of files.

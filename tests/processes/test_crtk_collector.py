@@ -17,8 +17,8 @@ from dvrk_drake.processes.collector import DELAY, CollectionSettings, Collector,
 from dvrk_drake.processes.ros_recorder import bag_path
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.systems.arm_station import ArmStation
+from dvrk_drake.systems.driver import CrtkDriver
 from dvrk_drake.systems.ros.crtk_arm_state import CrtkCommand
-from dvrk_drake.systems.ros.crtk_driver import CrtkDriver
 from dvrk_drake.systems.ros.crtk_move_link import GOAL_PERIOD, CrtkMoveLink
 from dvrk_drake.systems.ros.sim_crtk_driver import SimCrtkDriver
 
@@ -123,6 +123,7 @@ class Collection:
         checked = CollectionSettings(**({"traverse_time": 1.0} | settings))
         self.output = CollectionFile(path, arm.arm, checked.both_sides)
         self.link = CrtkMoveLink(arm, arm.model, checked.max_effort)
+        self.link.now = lambda: arm.time
         self.controller = GoalController(arm.arm, lambda: self.link.is_busy)
         self.collector = Collector(
             poses,
@@ -142,7 +143,7 @@ class Collection:
             assert self.arm.time < end, "the collection did not end"
             self.arm.step()
             try:
-                status = self.link.update(self.arm.time)
+                status = self.link.poll()
             except CollectionError as error:
                 collector.problem, collector.finished = error, True
                 break
@@ -430,12 +431,13 @@ def test_friction_cancels_in_both_approach_directions(tmp_path):
     settings = CollectionSettings()
     output = CollectionFile(tmp_path / "p.csv", MTML, both_sides=True)
     link = CrtkMoveLink(client, ControlModel(model), settings.max_effort)
+    link.now = lambda: client.time
     controller = GoalController(MTML, lambda: link.is_busy)
     collector = Collector(poses, controller, output, settings, writer=Disk())
     start, estimate = client.time, estimated_duration(MTML, np.zeros(7), poses, settings)
     while not collector.finished:
         assert client.time - start < 2 * estimate
-        status = link.update(client.time)
+        status = link.poll()
         link.send(controller.answer(status, client.time, collector.update(status, client.time)))
     output.close()
     assert collector.problem is None and collector.done.all()

@@ -24,7 +24,7 @@ from dvrk_drake.processes import pace
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.live_status import LiveLine
 from dvrk_drake.processes.simulated_arm import SimulatedArm, load_driver, start_pose, stop_on_signals
-from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.driver import DvrkDriver
 from dvrk_drake.systems.lcm.lcm_network import open_lcm
 from dvrk_drake.systems.lcm.sim_dvrk_driver import DvrkArmServer
 

@@ -8,9 +8,9 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.lcm_messages import decode
+from dvrk_drake.systems.driver import DvrkDriver
 from dvrk_drake.systems.guard.settings import GuardSettings, PlausibilitySettings
-from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
-from dvrk_drake.systems.ros import arrival_clock
+from dvrk_drake.systems.ros import joint_state_reader
 from dvrk_drake.systems.ros.crtk_bridge import CrtkBridge
 from dvrk_drake.systems.ros.joint_state_reader import JointMeasurement
 
@@ -84,7 +84,7 @@ class CrtkBench:
     """
 
     def __init__(self, monkeypatch, name="mtml", *, period=1.0, modes=("position", "effort"), key_file=""):
-        monkeypatch.setattr(arrival_clock, "time", self)
+        monkeypatch.setattr(joint_state_reader, "time", self)
         self.now, self.statuses, self.lines, self.blocked = 10_000 * MS, [], [], ""
         self.client, self.period = SubstituteClient(name), period
         n = self.client.arm.num_joints

@@ -13,8 +13,8 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.systems.arm_station import ArmStation
+from dvrk_drake.systems.driver import DvrkDriver
 from dvrk_drake.systems.hand import Hand, HandPath
-from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.messages import make_command
 from dvrk_drake.systems.lcm.sim_dvrk_driver import SimDvrkDriver
 

@@ -8,10 +8,10 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.systems.arm_station import ArmStation
+from dvrk_drake.systems.driver import DvrkDriver
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 from dvrk_drake.systems.guard.settings import GuardSettings
 from dvrk_drake.systems.hardware_arm_station import HardwareArmStation
-from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.sim_dvrk_driver import apply_driver_config
 
 ARM = load_arm("mtml")

@@ -15,9 +15,9 @@ from dvrk_drake.errors import ArmError, StationError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.systems.arm_station import ArmStation, station_ports
 from dvrk_drake.systems.closed_loop import add_closed_loop
+from dvrk_drake.systems.driver import CrtkDriver
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 from dvrk_drake.systems.hardware_arm_station import HardwareArmStation
-from dvrk_drake.systems.ros.crtk_driver import CrtkDriver
 from dvrk_drake.systems.station import Station
 from dvrk_drake.systems.station_config import StationArm, StationConfig, load_station_config
 

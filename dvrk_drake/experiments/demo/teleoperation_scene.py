@@ -12,7 +12,7 @@ from pydrake.systems.framework import Context
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.systems.arm_view.camera import geometry_corners
 from dvrk_drake.systems.arm_view.controls import PanelText
-from dvrk_drake.systems.arm_view.force_arrow import DrawnForce
+from dvrk_drake.systems.arm_view.efforts import DrawnForce
 from dvrk_drake.systems.arm_view.overlay import ArmOverlay
 from dvrk_drake.systems.arm_view.page import add_ground, start_meshcat
 from dvrk_drake.systems.teleoperated_arms import TeleoperatedArms

@@ -11,7 +11,7 @@ from dvrk_drake.models.plant import holding_torque, set_arm_positions
 from dvrk_drake.systems.arm_view.camera import close_up, framing, geometry_corners, home_position
 from dvrk_drake.systems.arm_view.controls import JointSliders
 from dvrk_drake.systems.arm_view.drawn_arm import DrawnArm
-from dvrk_drake.systems.arm_view.force_arrow import DrawnForce
+from dvrk_drake.systems.arm_view.efforts import DrawnForce
 from dvrk_drake.systems.arm_view.overlay import ArmOverlay
 
 #: Buttons of the view, and sliders that are 0 (off) or 1 (on), so that they show their state.

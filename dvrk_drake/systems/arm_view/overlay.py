@@ -17,8 +17,7 @@ from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.arm_view.camera import geometry_corners, home_position
 from dvrk_drake.systems.arm_view.controls import PanelText
 from dvrk_drake.systems.arm_view.drawn_arm import COMMANDED, GhostArm, Visibility
-from dvrk_drake.systems.arm_view.efforts import EffortArcs, axis_frames
-from dvrk_drake.systems.arm_view.force_arrow import FORCE_SCALE, DrawnForce, ForceArrow
+from dvrk_drake.systems.arm_view.efforts import FORCE_SCALE, DrawnForce, EffortArcs, ForceArrow, axis_frames
 
 DESIRED = "desired"
 #: Meaning of the colours of the efforts, for the control panel, which is 40 characters wide.

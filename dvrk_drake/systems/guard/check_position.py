@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dvrk_drake.systems.guard.check import Check, Sample
 from dvrk_drake.systems.guard.limits import Mask, Vector, clip, is_any
+from dvrk_drake.systems.guard.part import Check, Sample
 from dvrk_drake.systems.guard.settings import PlausibilitySettings
 
 if TYPE_CHECKING:

@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike
 from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.lcm_messages import describe_refusal
-from dvrk_drake.systems.guard.command_expiry import CommandExpiry
 from dvrk_drake.systems.guard.command_stream import (
     FOREIGN,
     OUT_OF_STREAM,
+    CommandExpiry,
     CommandInForce,
     CommandStream,
     GuardCounts,

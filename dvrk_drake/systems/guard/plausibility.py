@@ -6,11 +6,10 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from dvrk_drake.systems.guard.check import Check, Sample
 from dvrk_drake.systems.guard.check_effort import EffortTracking, Response
 from dvrk_drake.systems.guard.check_position import FrozenPosition, PositionJump, VelocityConsistency
 from dvrk_drake.systems.guard.limits import ArmModel, Mask, Vector, is_any
-from dvrk_drake.systems.guard.part import Part
+from dvrk_drake.systems.guard.part import Check, Part, Sample
 from dvrk_drake.systems.guard.settings import PlausibilitySettings
 
 if TYPE_CHECKING:

@@ -15,11 +15,11 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import MessageKey, command_channel, status_channel
 from dvrk_drake.systems.arm_station import ArmStation
+from dvrk_drake.systems.driver import DvrkDriver
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.guard.command_inbox import CommandInbox
 from dvrk_drake.systems.guard.command_stream import is_finite
-from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.messages import draw_id, fill_in_guard
 
 #: Shortest time [s] in which an effort grows from zero to its limit, outside the state EFFORT. The gains of the

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,17 +12,27 @@ from dvrk_drake.dynamics.identified_model import ControlModel, IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_force, lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import describe_state
+from dvrk_drake.systems.driver import ArmDriver
 from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.guard.command_inbox import CommandInbox
 from dvrk_drake.systems.guard.follower import GuardOutput
-from dvrk_drake.systems.lcm.dvrk_driver import ArmDriver
 from dvrk_drake.systems.lcm.messages import draw_id, fill_in_guard
-from dvrk_drake.systems.ros.arrival_clock import ArrivalClock
 from dvrk_drake.systems.ros.crtk_client import CrtkClient, connect_client
 from dvrk_drake.systems.ros.deadman import DeadmanProcess, describe_priority
 from dvrk_drake.systems.ros.discovery import END_OTHER_PROCESS
-from dvrk_drake.systems.ros.force_topics import ForceTopics
+from dvrk_drake.systems.ros.joint_state_reader import ArrivalClock
+from dvrk_drake.systems.ros.messages import (
+    Float64MultiArray,
+    Header,
+    MultiArrayDimension,
+    MultiArrayLayout,
+    Time,
+    Vector3,
+    Wrench,
+    WrenchStamped,
+)
 from dvrk_drake.systems.ros.open_domain import open_ros_domain
+from dvrk_drake.systems.ros.topic import Publisher
 
 #: Lowest rate of measured_js for POSITION and EFFORT [Hz].
 MIN_RATE = 500.0
@@ -44,6 +55,10 @@ _REPEAT = 100_000
 _LATE = 20_000
 #: Shortest time between two reports of problems with measured_js [us].
 _REPORT_PERIOD = 1_000_000
+#: Topics of the estimated external force below the namespace of an arm. They differ from `body/measured_cf`, the wrench
+#: that a dVRK computes from the measured efforts without friction and inertia.
+_FORCE, _COVARIANCE = "external_force/body/estimated_cf", "external_force/body/covariance"
+_LAYOUT = MultiArrayLayout([MultiArrayDimension("row", 3, 9), MultiArrayDimension("column", 3, 3)])
 
 
 class CrtkBridge:
@@ -101,7 +116,6 @@ class CrtkBridge:
         self._has_commands = self._awaits_answer = self._was_answered = False
         self.status = lcmt_dvrk_status()
         self.status.arm_name, self.status.num_joints = arm.name, arm.num_joints
-        self._force_topics: ForceTopics | None = None
         self._measured_utime, self._last_step = 0, 0
         self._nan = np.full(arm.num_joints, np.nan)
         self._measured = (self._nan, self._nan, self._nan)
@@ -155,14 +169,25 @@ class CrtkBridge:
         return is_answer
 
     def send_force(self, force: lcmt_dvrk_force) -> None:
-        """Publishes an estimated external force on topics of this package, see `ForceTopics`.
+        """Publishes an estimated external force with its covariance (3 x 3) on topics of this package.
+
+        The force is a wrench at the origin of its frame, without torque.
 
         Raises:
             DvrkDrakeError: DDS cannot send a message.
         """
-        if self._force_topics is None:
-            self._force_topics = ForceTopics(self._client.domain, self._client.namespace)
-        self._force_topics.publish(force)
+        wrench, matrix = self._force_topics
+        header = Header(Time(*divmod(1000 * force.utime, 10**9)), f"{force.arm_name}/{force.frame_name}")
+        wrench.publish(WrenchStamped(header, Wrench(Vector3(*force.force))))
+        matrix.publish(Float64MultiArray(_LAYOUT, [float(x) for row in force.force_covariance for x in row]))
+
+    @cached_property
+    def _force_topics(self) -> tuple[Publisher[WrenchStamped], Publisher[Float64MultiArray]]:
+        domain, namespace = self._client.domain, self._client.namespace
+        return (
+            domain.advertise(f"{namespace}/{_FORCE}", WrenchStamped),
+            domain.advertise(f"{namespace}/{_COVARIANCE}", Float64MultiArray),
+        )
 
     def close(self) -> bool:
         """Commands the arm to hold its present pose, and ends the deadman process.
@@ -402,7 +427,7 @@ def connect_bridge(
         arm: Arm to connect.
         driver: Configuration, see `CrtkBridge`.
         send_status: Function that sends an encoded status (lcmt_dvrk_status).
-        topic: Topic measured_js of the arm or its namespace; see `find_arm`.
+        topic: Topic measured_js of the arm or its namespace; see `find_topic`.
         domain: ROS domain. None: the environment variable ROS_DOMAIN_ID, or else 0.
         report: Function that is called with one line for each change of the state.
         stopped: Function that returns whether to end the connection, e.g. after Ctrl-C.

@@ -69,7 +69,7 @@ class CrtkObserver:
         Args:
             domain: ROS domain of the arm.
             arm: Arm with n joints.
-            namespace: Namespace of the topics, e.g. "/MTML". `find_arm` returns it.
+            namespace: Namespace of the topics, e.g. "/MTML". It is that of the topic that `find_topic` returns.
             polled: Whether the caller calls `receive_measurement` all the time, without waiting for messages of the
                 domain. Measurements then arrive earlier, because no thread wakes up for them.
 
@@ -325,29 +325,6 @@ def other_publishers(domain: RosDomain, arm: Arm, namespace: str) -> list[str]:
     return sorted(motion.intersection(topics)) + [topic for topic in of_arm if topics.count(topic) > 1]
 
 
-def find_arm(
-    domain: RosDomain,
-    arm: Arm,
-    topic: str | None = None,
-    *,
-    report: Callable[[str], None] = lambda line: None,
-    stopped: Callable[[], bool] = lambda: False,
-) -> str:
-    """Waits until the arm's topic measured_js is discovered, and returns the namespace of the arm, e.g. "/PSM1".
-
-    Args:
-        domain: ROS domain.
-        arm: Arm to find.
-        topic: Topic measured_js or its namespace; see `find_topic`.
-        report: Function that is called with one line if the search takes longer than a second.
-        stopped: Function that returns whether to end the search.
-
-    Raises:
-        RecordingError: See `find_topic`.
-    """
-    return find_topic(domain, arm, topic, report=report, stopped=stopped).rpartition("/")[0]
-
-
 def connect_client(
     domain: RosDomain,
     arm: Arm,
@@ -363,7 +340,7 @@ def connect_client(
     Args:
         domain: ROS domain of the arm.
         arm: Arm.
-        topic: Topic measured_js of the arm or its namespace; see `find_arm`.
+        topic: Topic measured_js of the arm or its namespace; see `find_topic`.
         commands: Names of the commands to which the arm must subscribe, see `CrtkClient.unheard_commands`.
         report: Function that is called with one line if the search for the arm takes longer than a second.
         stopped: Function that returns whether to end the search and the connection, e.g. after Ctrl-C.
@@ -374,7 +351,7 @@ def connect_client(
         ControllerError: Another process could move the arm, no operating state or measurement arrives, the joints do
             not fit, no process receives the commands, or the connection was stopped.
     """
-    namespace = find_arm(domain, arm, topic, report=report, stopped=stopped)
+    namespace = find_topic(domain, arm, topic, report=report, stopped=stopped).rpartition("/")[0]
     what = f"the connection to {namespace}"
     # The publishers of a new client would stop a bridge that already runs, so this check comes first. DDS lists a
     # killed process of this package for about a second, and others for 10 s.

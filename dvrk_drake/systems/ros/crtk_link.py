@@ -10,9 +10,9 @@ from collections.abc import Callable
 from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_force
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.systems.driver import CrtkDriver
 from dvrk_drake.systems.lcm.arm_link import MessageLink
 from dvrk_drake.systems.ros.crtk_bridge import CrtkBridge, connect_bridge
-from dvrk_drake.systems.ros.crtk_driver import CrtkDriver
 from dvrk_drake.systems.ros.open_domain import domain_number
 
 #: Longest wait for a message between two updates of the bridge [s].
@@ -83,7 +83,7 @@ class CrtkArmLink(MessageLink):
         _BRIDGES.append((domain_number(driver.domain), self._bridge))
 
     def send_force(self, force: lcmt_dvrk_force) -> None:
-        """Publishes an estimated external force on topics of this package, see `ForceTopics`."""
+        """Publishes an estimated external force on topics of this package, see `CrtkBridge.send_force`."""
         self._bridge.send_force(force)
 
     def close(self) -> None:

@@ -21,10 +21,10 @@ from dvrk_drake.errors import CollectionError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.systems.lcm.arm_link import ArmLink
-from dvrk_drake.systems.ros.arrival_clock import ArrivalClock
 from dvrk_drake.systems.ros.crtk_client import CrtkClient, connect_client
 from dvrk_drake.systems.ros.discovery import END_OTHER_PROCESS, wait_unless_stopped
 from dvrk_drake.systems.ros.domain import RosDomain
+from dvrk_drake.systems.ros.joint_state_reader import ArrivalClock
 
 #: Shortest time between two goals of a motion [s].
 GOAL_PERIOD = 0.1
@@ -96,10 +96,6 @@ class CrtkMoveLink(ArmLink):
         """Leaves the ROS domain."""
         self._client.domain.close()
 
-    def poll(self) -> lcmt_dvrk_status | None:
-        """Returns the measurement that arrived since the last call, or None. See `update` for errors."""
-        return self.update(self.now())
-
     def next_status(self, seconds: float) -> lcmt_dvrk_status:
         """Returns the next measurement. It waits until a measurement arrives or the silence is an error.
 
@@ -110,20 +106,14 @@ class CrtkMoveLink(ArmLink):
             self._client.domain.wait(_POLL)
         return status
 
-    def update(self, now: float) -> lcmt_dvrk_status | None:
-        """Receives messages and checks the arm.
-
-        Args:
-            now: Present time of the monotonic clock [s].
-
-        Returns:
-            New measurement, or None.
+    def poll(self) -> lcmt_dvrk_status | None:
+        """Receives messages and checks the arm. Returns a new measurement, or None.
 
         Raises:
             CollectionError: The motion must stop.
         """
         try:
-            return self._update(now)
+            return self._measure(self.now())
         except CollectionError as error:
             raise CollectionError(f"{self.arm.name} stopped: {error}") from None
 
@@ -149,7 +139,7 @@ class CrtkMoveLink(ArmLink):
             self._report(f"{self._client.namespace}: the arm did not confirm hold. PRESS THE STOP BUTTON")
         return True
 
-    def _update(self, now: float) -> lcmt_dvrk_status | None:
+    def _measure(self, now: float) -> lcmt_dvrk_status | None:
         client = self._client
         is_new = client.receive()
         if reason := client.not_ready_reason:
@@ -226,7 +216,7 @@ def connect_move_link(
         ros: ROS domain, which the link closes.
         arm: Arm on ROS 2.
         model: Model of the arm.
-        topic: Topic measured_js of the arm or its namespace; see `find_arm`.
+        topic: Topic measured_js of the arm or its namespace; see `find_topic`.
         max_effort: See `CrtkMoveLink`.
         report: Function that is called with lines about the search and the end of the connection.
         stopped: Function that returns whether to end the connection, e.g. after Ctrl-C.

@@ -13,9 +13,9 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.kinematics import ArmFrame
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.systems.arm_station import ArmStation
+from dvrk_drake.systems.driver import CrtkDriver
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 from dvrk_drake.systems.ros.crtk_arm_state import ArmValues, CrtkArmState, CrtkCommand
-from dvrk_drake.systems.ros.crtk_driver import CrtkDriver
 from dvrk_drake.systems.ros.open_domain import open_ros_domain
 
 if TYPE_CHECKING:

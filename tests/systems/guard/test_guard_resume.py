@@ -8,7 +8,7 @@ from guard_bench import MS, WITH_OFF, Bench, N, Q, modes
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
-from dvrk_drake.systems.guard.command_expiry import WallClock
+from dvrk_drake.systems.guard.command_stream import WallClock
 from dvrk_drake.systems.guard.settings import GuardSettings
 from dvrk_drake.systems.lcm.messages import fill_in_guard
 

@@ -10,11 +10,11 @@ from dvrk_drake.dynamics.identified_model import ControlModel, IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.lcm_messages import create_key_file
+from dvrk_drake.systems.driver import DvrkDriver
 from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.guard.settings import GuardSettings
 from dvrk_drake.systems.guard.states import State
 from dvrk_drake.systems.lcm.arm_link import DrakeLcmArmLink
-from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
 from dvrk_drake.systems.lcm.sim_dvrk_driver import DvrkArmServer
 
 pytestmark = pytest.mark.drake_api

@@ -8,7 +8,7 @@ from pydrake.lcm import DrakeLcm
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.systems.lcm.dvrk_driver import DvrkDriver
+from dvrk_drake.systems.driver import DvrkDriver
 
 ARMS = ["mtml", pytest.param("psm", marks=pytest.mark.slow)]
 

@@ -271,12 +271,12 @@ def test_real_time_priority_is_stated(refused):
 
 def test_stand_alone_command_requests_priority_before_dds(monkeypatch, capsys):
     from dvrk_drake.cli import main
-    from dvrk_drake.systems.ros import crtk_client, open_domain
+    from dvrk_drake.systems.ros import discovery, open_domain
 
     calls, requested = [], "real-time priority 60"
     monkeypatch.setattr(deadman, "request_priority", lambda: calls.append("priority") or requested)
     monkeypatch.setattr(open_domain, "open_ros_domain", lambda domain: calls.append("domain"))
-    monkeypatch.setattr(crtk_client, "find_arm", lambda *_, **__: ARM)
+    monkeypatch.setattr(discovery, "find_topic", lambda *_, **__: f"{ARM}/measured_js")
     monkeypatch.setattr(deadman, "Deadman", lambda *_: SimpleNamespace(run=lambda stopped: calls.append("run")))
     assert main(["bridge", "deadman", "--arm", "mtml"]) == 0
     assert calls == ["priority", "domain", "run"]

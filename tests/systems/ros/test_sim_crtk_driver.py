@@ -11,8 +11,8 @@ from dvrk_drake.errors import ModelError, StationError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.typed_yaml import load_typed_yaml
 from dvrk_drake.systems.arm_station import ArmStation
+from dvrk_drake.systems.driver import CrtkDriver
 from dvrk_drake.systems.ros.crtk_arm_state import CrtkCommand
-from dvrk_drake.systems.ros.crtk_driver import CrtkDriver
 from dvrk_drake.systems.ros.sim_crtk_driver import SimCrtkDriver
 
 pytestmark = pytest.mark.drake_api
