@@ -277,6 +277,24 @@ def test_actuator_coordinates_become_joint_coordinates(arm):
     np.testing.assert_array_equal(joint.t, actuator.t)
 
 
+@pytest.mark.parametrize(("name", "joint"), [("psm", 6), ("psm", 5), ("mtmr", 3), ("mtmr", 1), ("mtmr", 6)])
+def test_channels_use_only_measured_efforts(name, joint):
+    """The channels are the same for every effort of the joint that was not measured, and contain all other efforts."""
+    arm = load_arm(name)
+    tau = np.random.default_rng(5).normal(size=(2, 7)) + np.zeros((7, 1, 1))
+    tau = tau[0]
+    recording = Recording(q=np.zeros((2, 7)), tau=np.where(np.arange(7) == joint, 0.0, tau))
+    channels = recording.measured_channels(arm)
+    seen = [
+        (arm.transmission.inverse.pull_back_effort(tau + change * np.eye(7)[joint]) @ channels.T) for change in (0, 1)
+    ]
+    np.testing.assert_allclose(seen[0], seen[1], rtol=0, atol=1e-12)
+    assert np.linalg.matrix_rank(channels) == 6 and not channels[joint].any()
+    np.testing.assert_array_equal(recording.measured_joints(arm), np.arange(7) != joint)
+    motors = replace(recording, coordinates="actuator")
+    np.testing.assert_array_equal(motors.measured_channels(arm), np.diag(np.arange(7) != joint))
+
+
 @pytest.mark.parametrize(
     ("name", "num_rows"),
     [
