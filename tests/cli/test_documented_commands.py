@@ -103,19 +103,18 @@ def test_documentation_contains_all_commands():
 
 
 def test_files_and_commands_for_a_new_arm_work(tmp_path, monkeypatch):
-    """The files in docs/your_robot.md, whose first lines are their names, describe arms that the commands accept."""
+    """The files in docs/your_robot.md and in examples/ describe arms that the commands of the page accept."""
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
     for name in ("my_robot.urdf", "identified.urdf"):  # `export`, which needs a recording, writes the second file
         write_robot(tmp_path, name=name)
     page = (ROOT / "docs/your_robot.md").read_text()
-    for block in re.findall(r"```(?:yaml|xml)\n(.*?)```", page, re.DOTALL):
-        name = re.match(r"(?:#|<!--) (\S+)", block)
-        (tmp_path / name[1]).write_text(block)
-    arms = {path.name for path in tmp_path.glob("*.yaml") if "mechanism:" in path.read_text()}
-    assert arms == {"my_mtml.yaml", "psm_with_probe.yaml"}
-    assert {load_arm(arm).name for arm in arms} == {"MTML", "PSM"}
+    (block,) = re.findall(r"```yaml\n# my_mtml.yaml\n(.*?)```", page, re.DOTALL)
+    (tmp_path / "my_mtml.yaml").write_text(block)
     commands = [shlex.split(found["words"], comments=True) for found in LINE.finditer(page)]
-    assert {word for words in commands for word in words if word in arms} == arms
+    arms = {"my_mtml.yaml": "MTML", "examples/probe/psm_with_probe.yaml": "PSM"}
+    assert {arm: load_arm(arm).name for arm in arms} == arms
+    assert set(arms) <= {word for words in commands for word in words}
     for words in commands:
         if words[0] in ("arm-file", "simulate"):
             assert main(words) == 0, f"dvrk-drake {' '.join(words)}"
