@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,15 +112,15 @@ def prepare_export(
     format: Format,
     *,
     origin: str = "",
-    tolerance: float | None = None,
     friction: bool | Sequence[float] = False,
-    friction_ratio: Sequence[float] | None = None,
-    dead_band: Sequence[float] | None = None,
-    saturation: Sequence[float] | None = None,
     meshes: MeshFormat = "gltf",
     configuration: str | Path | None = None,
+    **options: Any,
 ) -> ModelExport:
-    """Returns the content that `export_model` writes. See `export_model` for arguments and errors."""
+    """Returns the content that `export_model` writes. See `export_model` for arguments and errors.
+
+    `options` are attributes of `CompensationOptions`, None for their default values.
+    """
     origin = origin or f"a model of {model.arm.name}"
     if format not in get_args(Format):
         raise ModelError(f'unknown format "{format}"; known formats: {", ".join(get_args(Format))}')
@@ -134,18 +134,12 @@ def prepare_export(
             drives = approximate_drives(model, coupled=format == "mjcf")
         return ModelExport(model, format, origin, bodies=model_bodies(model), drives=drives, meshes=meshes)
     if format == "dvrk-kinematic-gc":
-        file = kinematic_compensation(model, tolerance, configuration)
+        file = kinematic_compensation(model, options.get("tolerance"), configuration)
         return ModelExport(model, format, origin, compensation=file, configuration=configuration)
-    coulomb = None if friction is False else dry_friction(model) if friction is True else friction
-    given = {
-        "tolerance": tolerance,
-        "coulomb": coulomb,
-        "friction_ratio": friction_ratio,
-        "dead_band": dead_band,
-        "saturation": saturation,
-    }
-    options = CompensationOptions(**{k: v for k, v in given.items() if v is not None})  # type: ignore[arg-type]
-    return ModelExport(model, format, origin, compensation=compensation_from_model(model, options))
+    if friction is not False:
+        options["coulomb"] = dry_friction(model) if friction is True else friction
+    given = CompensationOptions(**{name: value for name, value in options.items() if value is not None})
+    return ModelExport(model, format, origin, compensation=compensation_from_model(model, given))
 
 
 def export_model(

@@ -13,10 +13,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm_schema import (
+    ANGLE_WIDTHS,
+    ANGLES,
     COUPLINGS,
     EFFORTS,
     GRAVITIES,
     POSITIONS,
+    TRAVEL_WIDTHS,
+    TRAVELS,
     CoupledLimit,
     Frames,
     Gains,
@@ -24,7 +28,6 @@ from dvrk_drake.models.arm_schema import (
     LoopClosure,
     ViewSettings,
 )
-from dvrk_drake.models.coupled_limits import can_meet_limits, coupled_limit_fault, limits_fault
 from dvrk_drake.models.effect_kinds import EFFECT_KINDS
 from dvrk_drake.models.effects_schema import ArmEffects, per_actuator
 from dvrk_drake.models.immutable import cached, immutable
@@ -156,18 +159,18 @@ class Arm:
         yield _count_fault("", {name: getattr(self, name) for name in arrays}, self.joint_names)
         for i, name in enumerate(self.joint_names):
             limits = float(self.position_lower[i]), float(self.position_upper[i])
-            yield limits_fault(f"position_limits.{name}", *limits, slides=bool(self.prismatic[i]))
+            yield _limits_fault(f"position_limits.{name}", *limits, slides=bool(self.prismatic[i]))
             yield EFFORTS.fault(f"effort limit of joint {name}", float(self.effort_limits[i]))
         if any(vars(self.gains).values()):
             yield self.gains_fault(self.gains)
         for limit in self.coupled_limits:
-            yield coupled_limit_fault(limit, self.joint_names, self.prismatic, self.position_lower, self.position_upper)
+            yield _coupled_limit_fault(self, limit)
         for name, row in self.friction_coordinates.items():
             if not np.any(row):
                 yield f"friction_coordinates.{name}: all coefficients are 0; at least one must be nonzero"
         yield number_fault(self)
         checked_gravity(self.gravity)
-        if len(self.coupled_limits) > 1 and not can_meet_limits(*self.limit_matrix()):
+        if len(self.coupled_limits) > 1 and not _can_meet_limits(*self.limit_matrix()):
             yield "coupled_limits: no pose within position_limits meets all coupled limits; widen the limits"
 
     @property
@@ -335,6 +338,45 @@ def _mounted(arm: Arm, gravity: tuple[float, ...]) -> Arm:
     if np.allclose(arm.gravity, gravity, rtol=0, atol=1e-12):
         return arm
     return dataclasses.replace(arm, gravity=np.array(gravity))
+
+
+def _coupled_limit_fault(arm: Arm, limit: CoupledLimit) -> str:
+    """Returns a message on the first fault of a coupled limit, with the accepted values, or "" if there is none."""
+    key = f"coupled_limits.{limit.name}"
+    row = np.array([limit.coefficients.get(name, 0.0) for name in arm.joint_names])
+    if not np.any(row):
+        return f"{key}: all coefficients are 0; allowed: at least one other value"
+    if fault := number_fault(limit):
+        return f"{key}.{fault}"
+    if fault := _limits_fault(key, limit.lower, limit.upper, slides=bool(np.all(arm.prismatic[row != 0]))):
+        return fault
+    lowest, highest = np.sort(row * [arm.position_lower, arm.position_upper], axis=0).sum(axis=1)
+    if highest < limit.lower or lowest > limit.upper:
+        return (
+            f"{key}: no pose within position_limits meets {limit.lower:g}..{limit.upper:g}; "
+            f"allowed: limits that overlap {lowest:.4g}..{highest:.4g}"
+        )
+    return ""
+
+
+def _limits_fault(key: str, lower: float, upper: float, slides: bool) -> str:
+    """Returns a message on the first fault of a lower and an upper position limit, or "" if there is none."""
+    positions, widths = (TRAVELS, TRAVEL_WIDTHS) if slides else (ANGLES, ANGLE_WIDTHS)
+    if fault := positions.fault(f"{key}[0]", lower) or positions.fault(f"{key}[1]", upper):
+        return fault
+    if not lower < upper:
+        return f"{key} is [{lower:g}, {upper:g}]; allowed: [lower, upper] with lower < upper"
+    return widths.fault(f"{key}: upper - lower", upper - lower)
+
+
+def _can_meet_limits(A: NDArray[np.float64], lower: NDArray[np.float64], upper: NDArray[np.float64]) -> bool:
+    """Returns whether at least one pose q meets lower <= A q <= upper. The first rows of A are the unit matrix."""
+    from scipy.optimize import linprog  # slow import; few arms have two coupled limits
+
+    n = A.shape[1]
+    bounds = np.column_stack([lower[:n], upper[:n]])
+    inequalities = np.vstack([A[n:], -A[n:]]), np.concatenate([upper[n:], -lower[n:]])
+    return bool(linprog(np.zeros(n), *inequalities, bounds=bounds).success)
 
 
 def _count_fault(key: str, values: Mapping[str, Sequence[float] | NDArray], joints: Sequence[str]) -> str:

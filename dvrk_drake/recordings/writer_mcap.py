@@ -191,14 +191,13 @@ def joint_state_topics(
         namespace: Namespace of the topics. Default: `/<ARM>`, where ARM is the name of the arm.
         name: Name of the topics in their namespace.
     """
-    namespace = f"/{arm.name}" if namespace is None else namespace
-    topics = []
-    for suffix, is_separate in (("", False), (f"/{arm.separate_joint}", True)):
-        columns = [i for i, joint in enumerate(arm.joint_names) if (joint == arm.separate_joint) == is_separate]
-        if columns:
-            joints = tuple(arm.joint_names[i] for i in columns)
-            topics.append(JointStateTopic(f"{namespace}{suffix}/{name}", joints, columns))
-    return tuple(topics)
+    namespace, topics = f"/{arm.name}" if namespace is None else namespace, dict[str, list[int]]()
+    for i, joint in enumerate(arm.joint_names):
+        part = f"/{joint}" if joint == arm.separate_joint else ""
+        topics.setdefault(f"{namespace}{part}/{name}", []).append(i)
+    return tuple(
+        JointStateTopic(topic, tuple(arm.joint_names[i] for i in columns), columns) for topic, columns in topics.items()
+    )
 
 
 class FrameMessages:
