@@ -44,7 +44,7 @@ from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.pace import make_realtime, settle_memory
 from dvrk_drake.processes.simulated_arm import SimulatedArm, monotonic_utime, start_pose, stop_on_signals
 from dvrk_drake.systems.driver import DvrkDriver
-from dvrk_drake.systems.lcm.lcm_network import open_lcm
+from dvrk_drake.systems.lcm.lcm_network import usable_lcm_url
 
 CONDITIONS = {"alone": 0, "two busy processes": 2}
 #: Minimum and maximum time for which efforts act before the kill [s].
@@ -92,7 +92,7 @@ def run_arm(name: str, realtime: bool) -> None:
         read[0] = monotonic_utime()
         return read[0]
 
-    simulated = SimulatedArm(arm, DvrkDriver(lcm_url=open_lcm().get_lcm_url()), start_pose(arm), clock)
+    simulated = SimulatedArm(arm, DvrkDriver(lcm_url=usable_lcm_url()), start_pose(arm), clock)
     stopped = stop_on_signals()
     if realtime:
         for warning in make_realtime():

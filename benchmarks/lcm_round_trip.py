@@ -47,7 +47,7 @@ from dvrk_drake.models.lcm_messages import command_channel, status_channel
 from dvrk_drake.processes.pace import Pace, make_realtime, settle_memory
 from dvrk_drake.processes.simulated_arm import SimulatedArm, start_pose
 from dvrk_drake.systems.driver import DvrkDriver
-from dvrk_drake.systems.lcm.lcm_network import handle_message, listen, open_lcm
+from dvrk_drake.systems.lcm.lcm_network import handle_message, listen, usable_lcm_url
 
 ARM = load_arm("mtml")
 ARMS = ("standing", "simulated")
@@ -129,7 +129,7 @@ class TimedSimulatedArm(SimulatedArm):
 
     def __init__(self) -> None:
         self.times = Times()
-        super().__init__(ARM, DvrkDriver(lcm_url=open_lcm().get_lcm_url()), start_pose(ARM))
+        super().__init__(ARM, DvrkDriver(lcm_url=usable_lcm_url()), start_pose(ARM))
 
     @property
     def acts(self) -> bool:

@@ -108,12 +108,12 @@ def view(
     from dvrk_drake.processes.live_view import LiveForce, show_status
     from dvrk_drake.systems.arm_view.arm_view import ArmView
     from dvrk_drake.systems.lcm.arm_link import LcmArmLink
-    from dvrk_drake.systems.lcm.lcm_network import open_lcm
+    from dvrk_drake.systems.lcm.lcm_network import usable_lcm_url
 
     if lcm_url and not live:
         raise DvrkDrakeError("--lcm-url requires --live")
     shown = dvrk.load_arm(arm, instrument)
-    url = open_lcm(lcm_url).get_lcm_url() if live else ""
+    url = usable_lcm_url(lcm_url) if live else ""
     meshcat = dvrk.start_meshcat(shown, port=port)
     arm_view = ArmView(shown, meshcat)
     arm_view.add_view_buttons()

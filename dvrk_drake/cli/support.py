@@ -259,13 +259,13 @@ def driver_configuration(path: str | None, key: str | None, lcm_url: str) -> Dvr
     """
     from dvrk_drake.processes.simulated_arm import load_driver
     from dvrk_drake.systems.driver import DvrkDriver
-    from dvrk_drake.systems.lcm.lcm_network import open_lcm
+    from dvrk_drake.systems.lcm.lcm_network import usable_lcm_url
 
     driver = DvrkDriver() if path is None else load_driver(path)
     driver.key_file = key or driver.key_file
     for warning in driver.warnings():
         print_warning(warning)
-    driver.lcm_url = open_lcm(lcm_url or driver.lcm_url).get_lcm_url()
+    driver.lcm_url = usable_lcm_url(lcm_url or driver.lcm_url)
     return driver
 
 

@@ -17,9 +17,8 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.approach import approach_offset
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_schema import Gains
-from dvrk_drake.systems.closed_loop import add_closed_loop
+from dvrk_drake.systems.closed_loop import EffortRamp, add_closed_loop
 from dvrk_drake.systems.driver import DvrkDriver
-from dvrk_drake.systems.effort_ramp import EffortRamp
 from dvrk_drake.systems.friction_compensator import FrictionCompensator
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController, Mode
 from dvrk_drake.systems.hardware_arm_station import HardwareArmStation

@@ -29,7 +29,7 @@ from dvrk_drake.systems.friction_compensator import FrictionCompensator
 from dvrk_drake.systems.gravity_pid_controller import Mode
 from dvrk_drake.systems.guard.settings import GuardSettings
 from dvrk_drake.systems.lcm.arm_link import ArmLink, LcmArmLink
-from dvrk_drake.systems.lcm.lcm_network import open_lcm
+from dvrk_drake.systems.lcm.lcm_network import usable_lcm_url
 from dvrk_drake.systems.ros.open_domain import require_cyclonedds
 
 if TYPE_CHECKING:
@@ -139,7 +139,7 @@ class ArmSession:
 
     def open_lcm_link(self, before: lcmt_dvrk_status | None = None) -> LcmArmLink:
         """Opens the channels over LCM; see `LcmArmLink` for `before`."""
-        return LcmArmLink(self.arm, open_lcm(self.lcm_url).get_lcm_url(), key=self.key, before=before)
+        return LcmArmLink(self.arm, usable_lcm_url(self.lcm_url), key=self.key, before=before)
 
     def _ros_link(self) -> ArmLink:
         """Returns a link to the guarded arm on ROS 2, once the rate of its measurements is known."""

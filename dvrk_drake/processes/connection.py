@@ -29,7 +29,7 @@ from dvrk_drake.recordings.writer_stream import check_stream_output
 from dvrk_drake.systems.friction_compensator import FrictionCompensator
 from dvrk_drake.systems.gravity_pid_controller import Mode
 from dvrk_drake.systems.guard.settings import GuardSettings
-from dvrk_drake.systems.lcm.lcm_network import open_lcm
+from dvrk_drake.systems.lcm.lcm_network import usable_lcm_url
 from dvrk_drake.systems.ros.discovery import find_topic
 from dvrk_drake.systems.ros.open_domain import open_ros_domain
 
@@ -195,7 +195,7 @@ class ArmConnection(ArmSession):
             recorder = RosRecorder(self.arm, path, self.topic, self.domain, self.dialog.report)
         else:
             check_stream_output(path)
-            recorder = LcmRecorder(self.arm, path, open_lcm(self.lcm_url).get_lcm_url(), self.key)
+            recorder = LcmRecorder(self.arm, path, usable_lcm_url(self.lcm_url), self.key)
         self.dialog.report(f"recording {self.arm.name} on {recorder.source}")
         recorder.run(duration, self.dialog.stopped, self.dialog.show)
         self.dialog.report(f"wrote {path}: {recorder.num_rows} rows")

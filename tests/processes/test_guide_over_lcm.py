@@ -11,7 +11,7 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.models.lcm_messages import command_channel, status_channel
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.systems.lcm.arm_link import LcmArmLink
-from dvrk_drake.systems.lcm.lcm_network import handle_message, open_lcm
+from dvrk_drake.systems.lcm.lcm_network import handle_message, usable_lcm_url
 
 pytestmark = pytest.mark.network
 
@@ -24,7 +24,7 @@ class NetworkArm(GuardedArm):
 
     def __init__(self):
         super().__init__()
-        url = open_lcm().get_lcm_url()
+        url = usable_lcm_url()
         self.network, self.link = lcm.LCM(url), LcmArmLink(ARM, url)
         self.link.now = self.now
         self.network.subscribe(command_channel(ARM), lambda channel, data: self.send(Command.decode(data)))

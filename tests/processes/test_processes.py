@@ -25,7 +25,7 @@ from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.live_status import LiveLine
 from dvrk_drake.processes.simulated_arm import SimulatedArm, load_driver, start_pose, stop_on_signals
 from dvrk_drake.systems.driver import DvrkDriver
-from dvrk_drake.systems.lcm.lcm_network import open_lcm
+from dvrk_drake.systems.lcm.lcm_network import usable_lcm_url
 from dvrk_drake.systems.lcm.sim_dvrk_driver import DvrkArmServer
 
 
@@ -135,7 +135,7 @@ def test_realtime_sets_scheduler_and_locks_memory():
 
 @pytest.mark.parametrize("url", ["bogus://", "udpm://nonsense"])
 def test_unusable_network_is_an_error(url):
-    assert_refused(DvrkDrakeError, f'LCM network "{url}" cannot be used', open_lcm, url)
+    assert_refused(DvrkDrakeError, f'LCM network "{url}" cannot be used', usable_lcm_url, url)
 
 
 class LossyLcm(lcm.LCM):
@@ -152,12 +152,12 @@ class LossyLcm(lcm.LCM):
 
 def test_network_with_lost_messages_is_usable(monkeypatch):
     monkeypatch.setattr("dvrk_drake.systems.lcm.lcm_network.lcm.LCM", LossyLcm)
-    assert open_lcm("memq://").get_lcm_url() == "memq://"
+    assert usable_lcm_url("memq://") == "memq://"
     assert LossyLcm.lost == 2
 
 
 def test_network_without_route_is_an_error():
-    code = "from dvrk_drake.systems.lcm.lcm_network import open_lcm; open_lcm()"
+    code = "from dvrk_drake.systems.lcm.lcm_network import usable_lcm_url; usable_lcm_url()"
     try:
         done = subprocess.run(
             ["unshare", "-rn", sys.executable, "-c", code], capture_output=True, text=True, timeout=TIMEOUT, check=False

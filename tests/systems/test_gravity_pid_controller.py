@@ -13,7 +13,7 @@ from dvrk_drake.errors import ControllerError, ModelError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.arm_schema import Gains
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions
-from dvrk_drake.systems.effort_ramp import EffortRamp
+from dvrk_drake.systems.closed_loop import EffortRamp
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 
 pytestmark = [pytest.mark.drake_api, pytest.mark.numeric]

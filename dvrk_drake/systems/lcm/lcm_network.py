@@ -1,4 +1,4 @@
-"""Opens an LCM network and handles its messages. Unlike LCM, it raises an exception for an unusable network."""
+"""Checks that an LCM network can be used, and handles its messages. LCM itself raises no exception."""
 
 from __future__ import annotations
 
@@ -16,21 +16,17 @@ from dvrk_drake.errors import DvrkDrakeError
 _OWN_MESSAGES, _NEXT_MESSAGE = 5.0, 0.2
 
 
-def open_lcm(url: str = "") -> DrakeLcm:
-    """Opens an LCM network.
+def usable_lcm_url(url: str = "") -> str:
+    """Returns the URL of an LCM network on which this process receives its own messages.
 
     Args:
         url: URL of the network. If it is empty, the environment variable LCM_DEFAULT_URL or LCM's default is used.
 
-    Returns:
-        LCM interface of the network.
-
     Raises:
         DvrkDrakeError: LCM does not support the URL, or this process does not receive its own messages.
     """
-    # Receiving is deferred, because an interface that only publishes needs no thread that wakes up for every message.
-    network = DrakeLcm(DrakeLcmParams(lcm_url=url, defer_initialization=True))
-    name = network.get_lcm_url()
+    # Drake's interface states the default URL. Receiving is deferred, because nothing is received with it.
+    name = str(DrakeLcm(DrakeLcmParams(lcm_url=url, defer_initialization=True)).get_lcm_url())
     try:
         own = lcm.LCM(name)
         channel, received = f"DVRK_SELF_TEST_{secrets.token_hex(8)}", []
@@ -48,7 +44,7 @@ def open_lcm(url: str = "") -> DrakeLcm:
             f'LCM network "{name}" does not deliver messages. Add a route for its multicast address. On one machine: '
             "ip link set lo multicast on; ip route add 239.255.0.0/16 dev lo"
         )
-    return network
+    return name
 
 
 def handle_message(network: lcm.LCM, seconds: float) -> bool:
