@@ -86,14 +86,13 @@ def _link_table(estimates: Sequence[Payload]) -> Table:
     """Returns the estimate for each link, best first."""
     good, rows = equally_good_links(estimates), []
     for payload in estimates:
-        note = "" if payload not in good else "best" if payload is estimates[0] else "equally good"
-        mass, error = "none found", ""
+        note, mass, error = "none found", "-", "-"
         if payload.found:
+            note = "" if payload not in good else "best" if payload is estimates[0] else "equally good"
             mass, error = f"{payload.body.mass:.4f}", f"{payload.mass_error:.4f}"
-        share = f"{100 * payload.relative_error:.1f} %"
-        rows.append((payload.link, share, mass, error, note if payload.found else ""))
+        rows.append((payload.link, f"{100 * payload.relative_error:.1f} %", mass, error, note))
     return Table(
-        ("", "error*", "mass [kg]", "+- [kg]", ""),
+        ("", "error*", "mass [kg]", "standard error [kg]", ""),
         rows,
         "Estimates by link, best first",
         "* whitened RMS error with payload / whitened RMS error without payload, cross-validated over the phase of the "
@@ -107,7 +106,7 @@ def _effort_table(payload: Payload) -> Table:
         (
             a.name,
             *(f"{x:.4f}" for x in (a.change, a.payload, a.left)),
-            "not loaded" if a.explained is None else f"{100 * a.explained:.1f} %",
+            "-" if a.explained is None else f"{100 * a.explained:.1f} %",
         )
         for a in payload.actuators
     ]
@@ -115,7 +114,8 @@ def _effort_table(payload: Payload) -> Table:
         ("", "measured", "payload", "residual*", "explained"),
         rows,
         "RMS change of the efforts [N m; N]",
-        "* after subtraction of the efforts of the payload and of the changes of offsets and friction",
+        "* after subtraction of the efforts of the payload and of the changes of offsets and friction. "
+        "- the payload does not load the joint.",
         show="details",
     )
 
@@ -136,6 +136,6 @@ def _none_found(payload: Payload, elsewhere: Sequence[Payload]) -> str:
 def _effort_plot(payload: Payload) -> Plot:
     """Returns the share of the change of the efforts that the payload explains."""
     loaded = {a.name: a.explained for a in payload.actuators if a.explained is not None}
-    bars = Bars("explained", list(loaded), [100 * max(share, 0.0) for share in loaded.values()], FITTED)
+    bars = Bars("", list(loaded), [100 * max(share, 0.0) for share in loaded.values()], FITTED)
     panel = category_panel("", [bars], "explained share of the squared change [%]")
     return Plot("efforts", f"Change of the efforts that a payload on {payload.link} explains", [panel])

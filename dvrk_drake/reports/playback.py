@@ -74,7 +74,7 @@ def playback(
     )
     assert poses is not None
     period = float(times[1] - times[0])
-    meshcat = start_meshcat(arm)
+    meshcat = start_meshcat(arm, poses=poses if ghosts is None else np.vstack([poses, ghosts]))
     links = DrawnArm(arm, meshcat, f"{arm.name.lower()}/links", color=rgba(color, 1.0) if color else None)
     overlay = ArmOverlay(arm, meshcat, trace=False)
     if ghosts is not None:

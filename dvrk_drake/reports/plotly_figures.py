@@ -19,8 +19,9 @@ FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Noto Sans', 'DejaVu Sans'
 SMALLEST_TEXT = 12
 #: Gap between rows of panels with and without labels of the x axis, and margin below the last row [px].
 _GAP, _SMALL_GAP, _BOTTOM = 92, 34, 56
-#: Margin above the first row without a legend, height of a line of the legend, and width of the narrowest legend [px].
-_TOP, _LEGEND_LINE, _LEGEND_WIDTH = 34, 20, 600
+#: Margin above the first row without a legend, height of a line of the legend, and width of the narrowest legend [px],
+#: which is that of a plot beside a 3D view on a page of 1280 px.
+_TOP, _LEGEND_LINE, _LEGEND_WIDTH = 34, 20, 440
 #: Approximate width of a character of the legend, and of the symbol of an entry [px].
 _CHARACTER, _SYMBOL = 7, 48
 INK, LINE, GRID = "#1b2733", "#6b7785", "#e3e7eb"
@@ -87,7 +88,7 @@ def plotly_figure(plot: Plot) -> go.Figure:
         row_heights=heights,
         shared_xaxes=plot.shared_x,
         vertical_spacing=gap / inside,
-        horizontal_spacing=0.14 / max(columns - 1, 1) if columns > 1 else 0.0,
+        horizontal_spacing=0.13 if columns > 1 else 0.0,  # 80 px on a page of 800 px, for labels and ticks
         subplot_titles=[panel.title for panel in plot.panels],
     )
     names: set[str] = set()
@@ -115,7 +116,11 @@ def plotly_figure(plot: Plot) -> go.Figure:
 def _legend_lines(plot: Plot) -> int:
     """Returns the number of lines of the legend on a narrow page."""
     names = dict.fromkeys(mark.name for panel in plot.panels for mark in panel.marks if mark.name)
-    return -(-sum(_CHARACTER * len(name) + _SYMBOL for name in names) // _LEGEND_WIDTH)
+    widths = [_CHARACTER * len(name) + _SYMBOL for name in names]
+    if sum(widths) <= _LEGEND_WIDTH:
+        return 1 if names else 0
+    # Plotly makes all entries of a legend with several lines as wide as the widest one.
+    return -(-len(names) // max(1, _LEGEND_WIDTH // max(widths)))
 
 
 def _draw(figure: go.Figure, panel: Panel, at: dict[str, int], names: set[str]) -> None:

@@ -76,7 +76,7 @@ def _plot(simulation: Simulation, arm: Arm) -> Plot:
         limits = _range(*shown, smallest=_SMALLEST_RANGE * scale)
         panels.append(Panel(title, position, "time [s]", f"position [{unit}]", y_range=limits, height=130))
         panels += [*error_panel, _effort_panel(arm, j, t, tau[:, j], hand)]
-    quantities = "position and effort" if desired is None else "position, position error and effort"
+    quantities = "Position and effort" if desired is None else "Position, position error and effort"
     return Plot("simulation", f"{quantities} of each joint", panels, columns=2 if desired is None else 3)
 
 
@@ -86,7 +86,8 @@ def _effort_panel(arm: Arm, j: int, t: NDArray[np.float64], tau: NDArray[np.floa
     marks = [*hand, Curve("", t, tau, MEASURED)]
     if share > _NEAR_LIMIT:
         marks += [Guide("y", sign * limit, None, LIMIT, "effort limit") for sign in (-1, 1)]
-    title, unit = f"largest {100 * share:.0f} % of {limit:.3g} {effort_unit(arm, j)}", effort_unit(arm, j)
+    unit = effort_unit(arm, j)
+    title = f"{joint_label(arm, j)}: largest {100 * share:.0f} % of {limit:.3g} {unit}"
     shown = (tau, np.array([-limit, limit])) if share > _NEAR_LIMIT else (tau,)
     y_range = _range(*shown, smallest=0.02 * limit)
     return Panel(title, marks, "time [s]", f"effort [{unit}]", y_range=y_range, height=130)

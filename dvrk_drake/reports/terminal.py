@@ -89,13 +89,15 @@ def print_page(console: Console, page: Page, *, verbose: bool = False) -> None:
     for before, block in zip([None, *blocks], blocks, strict=False):
         if (isinstance(before, Table) and not before.note) or (isinstance(before, Text) and isinstance(block, Table)):
             console.print()
+        width = min(console.width, TABLE_WIDTH)
         if isinstance(block, Table):
-            console.print(make_table(block))
+            if block.caption:
+                console.print(block.caption, style="bold", markup=False, width=width)
+            console.print(_make_table(block))
             if block.note:
-                _print_note(console, block.note)
+                console.print(f"{_plain(block.note)}\n", style="dim", markup=False, width=width)
         else:
             style = _STYLES[block.level] if block.level != "plain" or block.show == "always" else "dim"
-            width = min(console.width, TABLE_WIDTH)
             if block.unwrapped:
                 console.print(block.text, style=style, markup=False, soft_wrap=True)
             else:
@@ -116,11 +118,9 @@ def print_answer(console: Console, answer: str, level: Level = "good") -> None:
     console.print()
 
 
-def make_table(block: Table) -> rich_table.Table:
-    """Returns a table with a bold title. The first column may be folded, because it can contain long names."""
-    # Without these options, a title that is wider than the table would be wrapped.
-    title = RichText(block.caption, style="bold", no_wrap=True, overflow="ignore")
-    table = rich_table.Table(title=title, title_justify="left", box=None, pad_edge=False, expand=False)
+def _make_table(block: Table) -> rich_table.Table:
+    """Returns a table without its title. The first column may be folded, because it can contain long names."""
+    table = rich_table.Table(box=None, pad_edge=False, expand=False)
     last = len(block.header) - 1
     for i, (heading, right) in enumerate(zip(block.header, block.aligned_right, strict=True)):
         text_at_end = i == last and not right
@@ -134,10 +134,6 @@ def make_table(block: Table) -> rich_table.Table:
 
 def _cell(cell: Cell) -> RichText:
     return RichText(cell_text(cell), style=_STYLES[cell.level] if isinstance(cell, Verdict) else "")
-
-
-def _print_note(console: Console, text: str) -> None:
-    console.print(f"{_plain(text)}\n", style="dim", markup=False, width=min(console.width, TABLE_WIDTH))
 
 
 def _plain(text: str) -> str:

@@ -8,7 +8,7 @@ from pydrake.geometry import Meshcat, Role
 
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import holding_torque, set_arm_positions
-from dvrk_drake.systems.arm_view.camera import close_up, framing, geometry_corners, home_position
+from dvrk_drake.systems.arm_view.camera import corners_at, framing, geometry_corners, home_position
 from dvrk_drake.systems.arm_view.controls import JointSliders
 from dvrk_drake.systems.arm_view.drawn_arm import DrawnArm
 from dvrk_drake.systems.arm_view.efforts import DrawnForce
@@ -87,10 +87,10 @@ class ArmView:
 
     def look_at(self, preset: str) -> None:
         """Moves the camera to one of `camera_presets`. A close-up shows its links at the pose that was drawn last."""
-        position, target = framing(self.arm)
+        position, target = framing(geometry_corners(self.arm))
         whole_distance = np.linalg.norm(position - target)
         if (links := self.arm.view.close_ups.get(preset)) is not None:
-            position, target = close_up(self.arm, self._q, tuple(links))
+            position, target = framing(corners_at(self.arm, self._q, tuple(links)))
         # In a close-up, arcs and frames would otherwise be larger than the links.
         self._scale = min(1.0, _CLOSE_UP * float(np.linalg.norm(position - target) / whole_distance))
         self.overlay.resize(self._scale)

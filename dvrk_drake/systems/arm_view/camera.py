@@ -22,7 +22,8 @@ EXTENSION = 5 / 12
 #: 75 degrees.
 DIRECTION, ZOOM = (1.1, 1.0, 0.3), 2.8
 #: Half the height of the view at distance 1 from the camera. Aspect ratio (width / height) of a common browser window.
-HALF_HEIGHT, ASPECT = np.tan(np.radians(75 / 2)) / ZOOM, 1.2
+#: Aspect ratio of the 3D view of a report, which is beside plots.
+HALF_HEIGHT, ASPECT, REPORT_ASPECT = np.tan(np.radians(75 / 2)) / ZOOM, 1.2, 0.8
 #: Displacement of a joint from home in the poses that must be inside the view, as a fraction of the distance from home
 #: to the joint limit. With a fraction of 1, the arm would appear small. Ratio of the size of the view to the size that
 #: these poses require.
@@ -31,39 +32,19 @@ SHARE, MARGIN = 0.75, 1.05
 _LEAST_WIDTH = 0.02
 
 
-def framing(arm: Arm) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns positions (3,) [m] of a camera and of its target in the base frame, so that the arm fills the view.
-
-    The view contains the arm at home. It also contains the poses in which one joint is displaced towards one of its
-    limits, by the fraction `SHARE` of the distance to this limit.
-
-    Raises:
-        ArmError: The arm has no visual geometry.
-    """
-    return _framing(geometry_corners(arm))
-
-
-def close_up(arm: Arm, q: ArrayLike, links: tuple[str, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns positions (3,) [m] of a camera and of its target in the base frame, so that links fill the view.
+def framing(p_WC: NDArray[np.float64], aspect: float = ASPECT) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns positions (3,) [m] of a camera and of its target in the base frame, so that points fill the view.
 
     Args:
-        arm: Arm with the links.
-        q: Pose (n,) of the arm [rad, m].
-        links: Names of the links.
-
-    Raises:
-        ArmError: The links have no visual geometry.
+        p_WC: Points (k, 3) in the base frame [m], see `geometry_corners` and `corners_at`.
+        aspect: Width / height of the view.
     """
-    return _framing(_corners(arm, np.atleast_2d(np.asarray(q, float)), links))
-
-
-def _framing(p_WC: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     target = (p_WC.min(axis=0) + p_WC.max(axis=0)) / 2
     back = np.array(DIRECTION) / np.linalg.norm(DIRECTION)
     right = np.cross([0.0, 0.0, 1.0], back)
     right /= np.linalg.norm(right)
     from_target = p_WC - target
-    off_axis = np.abs(from_target @ np.column_stack([right / ASPECT, np.cross(back, right)])).max(axis=1)
+    off_axis = np.abs(from_target @ np.column_stack([right / aspect, np.cross(back, right)])).max(axis=1)
     off_axis = np.maximum(off_axis, _LEAST_WIDTH / 2)
     return target + np.max(from_target @ back + MARGIN * off_axis / HALF_HEIGHT) * back, target
 
@@ -83,18 +64,28 @@ def home_position(arm: Arm) -> NDArray[np.float64]:
 def geometry_corners(arm: Arm) -> NDArray[np.float64]:
     """Returns the corners (k, 3) of boxes around the visual geometry in the base frame [m].
 
-    The corners are those at all poses that the view must show.
+    The poses are home, and those in which one joint is displaced towards one of its limits, by the fraction `SHARE` of
+    the distance to this limit.
 
     Raises:
         ArmError: The arm has no visual geometry.
     """
     home = home_position(arm)
     steps = [SHARE * np.diag(limit - home) for limit in (arm.position_lower, arm.position_upper)]
-    return _corners(arm, home + np.vstack([np.zeros_like(home), *steps]), ())
+    return corners_at(arm, home + np.vstack([np.zeros_like(home), *steps]))
 
 
-def _corners(arm: Arm, poses: NDArray[np.float64], links: tuple[str, ...]) -> NDArray[np.float64]:
-    """Returns the corners (k, 3) of the visual geometry of links, or of all links, at poses (m, n)."""
+def corners_at(arm: Arm, poses: ArrayLike, links: tuple[str, ...] = ()) -> NDArray[np.float64]:
+    """Returns the corners (k, 3) of boxes around visual geometry in the base frame [m], at given poses.
+
+    Args:
+        arm: Arm.
+        poses: Poses (m, n) of the joints [rad, m].
+        links: Names of the links. Empty: all links.
+
+    Raises:
+        ArmError: The arm or the links have no visual geometry.
+    """
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=1e-3)
     add_arm(plant, arm)
@@ -102,8 +93,8 @@ def _corners(arm: Arm, poses: NDArray[np.float64], links: tuple[str, ...]) -> ND
     diagram = builder.Build()
     context = diagram.CreateDefaultContext()
     query_port, inspector = scene_graph.get_query_output_port(), scene_graph.model_inspector()
-    corners = []
-    for q in poses:
+    corners, signs = [], np.array(list(product((-1.0, 1.0), repeat=3)))
+    for q in np.atleast_2d(np.asarray(poses, float)):
         set_arm_positions(plant, plant.GetMyMutableContextFromRoot(context), arm, q)
         query = query_port.Eval(scene_graph.GetMyContextFromRoot(context))
         for geometry in inspector.GetAllGeometryIds(Role.kIllustration):
@@ -112,7 +103,7 @@ def _corners(arm: Arm, poses: NDArray[np.float64], links: tuple[str, ...]) -> ND
                 continue
             box = inspector.GetObbInGeometryFrame(geometry)
             X_WB = query.GetPoseInWorld(geometry) @ box.pose()
-            corners.append([X_WB @ (box.half_width() * sign) for sign in product((-1.0, 1.0), repeat=3)])
+            corners.append((X_WB @ (box.half_width() * signs).T).T)
     if not corners:
         raise ArmError(f"{arm.name} has no visual geometry" + (f" of {', '.join(links)}" if links else ""))
     return np.concatenate(corners)

@@ -14,7 +14,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.systems.arm_view.camera import ZOOM, framing, geometry_corners
+from dvrk_drake.systems.arm_view.camera import ASPECT, REPORT_ASPECT, ZOOM, corners_at, framing, geometry_corners
 from dvrk_drake.systems.arm_view.efforts import share_color
 
 #: Colours of the background. Light castings and dark motors of an arm stand out from both.
@@ -32,6 +32,7 @@ _VIEWS: list[Meshcat] = []
 def start_meshcat(
     arm: Arm | None = None,
     *,
+    poses: ArrayLike | None = None,
     camera: ArrayLike = (2.0, 2.0, 1.0),
     target: ArrayLike = (0.0, 0.0, 0.0),
     zoom: float = ZOOM,
@@ -42,6 +43,7 @@ def start_meshcat(
     Args:
         arm: Arm that fills the view. The caller draws it, e.g. with `ArmStation(arm, meshcat=meshcat)`. None: `camera`
             and `target` define the view, and there is no ground.
+        poses: Poses (m, n) [rad, m] of the arm that a report shows. None: any poses of the arm.
         camera: Position (3,) [m] of the camera, for a view without an arm.
         target: Position (3,) [m] of the camera's target, for a view without an arm.
         zoom: Magnification relative to Meshcat's default view angle of 75 degrees.
@@ -60,7 +62,8 @@ def start_meshcat(
         True
     """
     if arm is not None:
-        camera, target = framing(arm)
+        corners = geometry_corners(arm) if poses is None else corners_at(arm, poses)
+        camera, target = framing(corners, ASPECT if poses is None else REPORT_ASPECT)
     if port is not None and not 1024 <= port <= 65535:
         raise DvrkDrakeError(f"port {port} cannot be opened; allowed: 1024..65535")
     try:
@@ -80,7 +83,7 @@ def start_meshcat(
     meshcat.SetProperty("/Cameras/default/rotated/<object>", "zoom", zoom)
     meshcat.SetCameraPose(np.asarray(camera, float), np.asarray(target, float))
     if arm is not None:
-        add_ground(meshcat, geometry_corners(arm), arm.gravity)
+        add_ground(meshcat, corners, arm.gravity)
     return meshcat
 
 

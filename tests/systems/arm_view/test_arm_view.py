@@ -19,7 +19,7 @@ from dvrk_drake.models.plant import set_arm_positions, shared_plant
 from dvrk_drake.processes.live_view import LiveForce, show_status
 from dvrk_drake.systems.arm_view import page
 from dvrk_drake.systems.arm_view.arm_view import DEGREES, FRAMES, ArmView
-from dvrk_drake.systems.arm_view.camera import ASPECT, HALF_HEIGHT, close_up, framing, geometry_corners
+from dvrk_drake.systems.arm_view.camera import ASPECT, HALF_HEIGHT, REPORT_ASPECT, corners_at, framing, geometry_corners
 from dvrk_drake.systems.arm_view.drawn_arm import Visibility
 from dvrk_drake.systems.arm_view.efforts import LEVELS, axis_frames
 from dvrk_drake.systems.arm_view.overlay import ArmOverlay
@@ -176,15 +176,16 @@ def test_live_force_is_drawn_in_the_base_frame_while_it_is_valid():
 # Camera positions: the arm fills the view, and close-ups show only their links.
 
 
+@pytest.mark.parametrize("aspect", [ASPECT, REPORT_ASPECT])
 @pytest.mark.parametrize("name", ["mtml", "psm"])
-def test_camera_frames_the_whole_arm(name):
-    arm = load_arm(name)
-    camera, target = framing(arm)
+def test_camera_frames_the_whole_arm(name, aspect):
+    corners = geometry_corners(load_arm(name))
+    camera, target = framing(corners, aspect)
     forward = (target - camera) / np.linalg.norm(target - camera)
     right = np.cross(forward, [0, 0, 1]) / np.linalg.norm(np.cross(forward, [0, 0, 1]))
-    seen = geometry_corners(arm) - camera
+    seen = corners - camera
     half_height = HALF_HEIGHT * (seen @ forward)
-    share = np.maximum(np.abs(seen @ right) / ASPECT, np.abs(seen @ np.cross(right, forward))) / half_height
+    share = np.maximum(np.abs(seen @ right) / aspect, np.abs(seen @ np.cross(right, forward))) / half_height
     assert (half_height > 0).all()
     assert 0.8 < share.max() < 1.0
 
@@ -192,10 +193,10 @@ def test_camera_frames_the_whole_arm(name):
 def test_close_up_is_nearer_than_the_whole_arm():
     for name in ("mtmr", "psm"):
         arm = load_arm(name)
-        camera, target = framing(arm)
+        camera, target = framing(geometry_corners(arm))
         q = np.clip(np.zeros(7), arm.position_lower, arm.position_upper)
         for links in arm.view.close_ups.values():
-            near, near_target = close_up(arm, q, tuple(links))
+            near, near_target = framing(corners_at(arm, q, tuple(links)))
             assert np.linalg.norm(near - near_target) < 0.6 * np.linalg.norm(camera - target)
 
 
