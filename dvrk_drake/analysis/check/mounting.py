@@ -83,17 +83,18 @@ def find_mounting(observations: Observations) -> tuple[Arm, list[Finding]]:
     if not len(fit.used):
         return arm, []
     search = _Search(fit)
-    gravity, offsets = search.best()
-    # A zero may differ by a half turn in both directions. One of them moves the positions to the middle of the limits.
-    middle = np.mean(own.recording.in_joint_coordinates(arm).q, axis=0) + offsets
-    middle -= (arm.position_lower + arm.position_upper) / 2
-    is_half = np.abs(offsets) > 3 / 4 * np.pi
-    offsets = np.where(is_half, offsets - 2 * np.pi * np.round(middle / (2 * np.pi)), offsets)
+    # Another gravity can hide a zero that is no multiple of 90 degrees, so the stated gravity is also tried.
+    (gravity, offsets), free = (_centred(own, arm, *search.best(is_free)) for is_free in (False, True))
+    gain = _log_likelihood(own, _arm_with(arm, gravity, offsets)) - fit.log_likelihood
+    if not np.array_equal(free[0], gravity):
+        free_gain = _log_likelihood(own, _arm_with(arm, *free)) - fit.log_likelihood
+        if free_gain - gain > MIN_CONFIRMED_GAIN:
+            (gravity, offsets), gain = free, free_gain
     scale = list(_scale_findings(arm, search.scale(gravity, offsets))) if has_converted_model(arm) else []
     found = _arm_with(arm, gravity, offsets)
     if found is arm:
         return arm, scale
-    gain, is_used = _log_likelihood(own, found) - fit.log_likelihood, is_assumed(arm)
+    is_used = is_assumed(arm)
     # Opposite gravity and opposite efforts differ by friction and inertia. `check_channels` reports the latter.
     opposite = fit.gain(-np.eye(arm.num_joints)) if fit.moves else 0.0
     if gain < max(MIN_CONFIRMED_GAIN, opposite):
@@ -109,6 +110,16 @@ def find_mounting(observations: Observations) -> tuple[Arm, list[Finding]]:
         )
         findings.append(Finding("warning", "mounting", arm.name, what, _STATE_MOUNTING))
     return used, [*findings, *scale]
+
+
+def _centred(
+    own: Observations, arm: Arm, gravity: NDArray[np.float64], offsets: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns gravity, and offsets of which those near a half turn move the positions to the middle of the limits."""
+    middle = np.mean(own.recording.in_joint_coordinates(arm).q, axis=0) + offsets
+    middle -= (arm.position_lower + arm.position_upper) / 2
+    is_half = np.abs(offsets) > 3 / 4 * np.pi
+    return gravity, np.where(is_half, offsets - 2 * np.pi * np.round(middle / (2 * np.pi)), offsets)
 
 
 def _is_square(gravity: NDArray[np.float64], offsets: NDArray[np.float64]) -> bool:
@@ -184,14 +195,14 @@ class _Search:
             for v, s in zip(velocities.T, scale, strict=True)
         ]
 
-    def best(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def best(self, gravity_is_free: bool) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Returns the gravity vector (3,) [m/s^2] and the joint offsets (n,) [rad, m].
 
-        Gravity and the joint zeros can all differ from the model. Gravity is estimated for each combination of zeros,
-        because with wrong zeros its estimate is wrong too.
+        Gravity and the joint zeros can all differ from the model. A free gravity is estimated for each combination of
+        zeros, because with wrong zeros its estimate is wrong too.
         """
         n = self._arm.num_joints
-        best = (*self._best_gravity(np.zeros(n)), np.zeros(n))
+        best = (*self._best_gravity(np.zeros(n), gravity_is_free), np.zeros(n))
         kept = [best]
         for _ in range(n):
             turned = {
@@ -200,7 +211,7 @@ class _Search:
                 for j in np.flatnonzero(~self._arm.prismatic & (offsets == 0))
                 for turn in QUARTER_TURNS
             }
-            trials = [(*self._best_gravity(np.array(offsets)), np.array(offsets)) for offsets in sorted(turned)]
+            trials = [(*self._best_gravity(np.array(x), gravity_is_free), np.array(x)) for x in sorted(turned)]
             kept = sorted(trials, key=lambda trial: -trial[0])[:_NUM_KEPT]
             if not kept or kept[0][0] - best[0] < MIN_GAIN:
                 break
@@ -240,10 +251,12 @@ class _Search:
         is_similar = both > MIN_SIMILARITY * np.sqrt(measured * nominal) > 0
         return float(both / nominal) if is_similar else 1.0
 
-    def _best_gravity(self, offsets: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+    def _best_gravity(self, offsets: NDArray[np.float64], is_free: bool) -> tuple[float, NDArray[np.float64]]:
         """Returns the log-likelihood for offsets (n,), and the stated gravity (3,) or a much more likely one."""
         unit_efforts = np.stack([self._fit.holding_efforts(axis, offsets) for axis in np.eye(3)], axis=2)
         stated = self._log_likelihood(unit_efforts @ self._arm.gravity)
+        if not is_free:
+            return stated, self._arm.gravity
         estimate = self._estimated_gravity(unit_efforts)
         likelihood = self._log_likelihood(unit_efforts @ estimate)
         is_used = _angle(estimate, self._arm.gravity) > MIN_ANGLE and likelihood - stated > MIN_GAIN
