@@ -74,12 +74,13 @@ def playback(
     )
     assert poses is not None
     period = float(times[1] - times[0])
-    meshcat = start_meshcat(arm, poses=poses if ghosts is None else np.vstack([poses, ghosts]))
+    nearest = np.abs(np.subtract.outer(times, t)).argmin(axis=1) if forces is not None else None
+    ends = None if forces is None or nearest is None else [forces[k].end for k in nearest]
+    meshcat = start_meshcat(arm, poses=poses if ghosts is None else np.vstack([poses, ghosts]), points=ends)
     links = DrawnArm(arm, meshcat, f"{arm.name.lower()}/links", color=rgba(color, 1.0) if color else None)
     overlay = ArmOverlay(arm, meshcat, trace=False)
     if ghosts is not None:
         overlay.add_ghost(_GHOST, rgba(REFERENCE, 0.5))
-    nearest = np.abs(np.subtract.outer(times, t)).argmin(axis=1) if forces is not None else None
     meshcat.StartRecording(frames_per_second=1 / period)
     for k, pose in enumerate(poses):
         # The time is in the middle of the frame, so that rounding does not change the number of the frame.

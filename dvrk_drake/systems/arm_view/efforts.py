@@ -165,6 +165,11 @@ class DrawnForce(NamedTuple):
     force: NDArray[np.float64]
     covariance: NDArray[np.float64]
 
+    @property
+    def end(self) -> NDArray[np.float64]:
+        """End (3,) of the arrow in the base frame [m]."""
+        return self.point + LENGTH * self.force
+
 
 class ForceArrow:
     """Arrow that begins at the point of a force. Its end is the centre of the ellipsoid that contains 95 % of forces.
@@ -189,16 +194,15 @@ class ForceArrow:
         length = LENGTH * float(np.linalg.norm(drawn.force))
         axis = drawn.force if length > 0 else np.array([0.0, 0.0, 1.0])
         R = RotationMatrix.MakeFromOneVector(axis, 2)
-        end = drawn.point + LENGTH * drawn.force
         head = min(_HEAD_LENGTH, length)
         self._place("arrow", RigidTransform(R, drawn.point), "shaft", [1.0, 1.0, length - head], time)
         # The point of the cone is at its origin, and the cone extends along z.
         back = R @ RotationMatrix.MakeXRotation(np.pi)
-        self._place("head", RigidTransform(back, end), "size", [head / _HEAD_LENGTH] * 3, time)
+        self._place("head", RigidTransform(back, drawn.end), "size", [head / _HEAD_LENGTH] * 3, time)
         variances, axes = np.linalg.eigh(drawn.covariance)
         axes[:, 0] *= np.sign(np.linalg.det(axes))  # a rotation, not a reflection
         radii = LENGTH * _RADIUS_95 * np.sqrt(np.clip(variances, 0.0, MAX_DEVIATION**2))
-        X = RigidTransform(RotationMatrix.ProjectToRotationMatrix(axes), end)
+        X = RigidTransform(RotationMatrix.ProjectToRotationMatrix(axes), drawn.end)
         self._place("ellipsoid", X, "size", radii.tolist(), time)
 
     def _place(self, name: str, X: RigidTransform, scaled: str, scale: list[float], time: float | None) -> None:

@@ -33,6 +33,7 @@ def start_meshcat(
     arm: Arm | None = None,
     *,
     poses: ArrayLike | None = None,
+    points: ArrayLike | None = None,
     camera: ArrayLike = (2.0, 2.0, 1.0),
     target: ArrayLike = (0.0, 0.0, 0.0),
     zoom: float = ZOOM,
@@ -44,6 +45,7 @@ def start_meshcat(
         arm: Arm that fills the view. The caller draws it, e.g. with `ArmStation(arm, meshcat=meshcat)`. None: `camera`
             and `target` define the view, and there is no ground.
         poses: Poses (m, n) [rad, m] of the arm that a report shows. None: any poses of the arm.
+        points: Points (k, 3) in the base frame [m] that are visible beside the arm at `poses`.
         camera: Position (3,) [m] of the camera, for a view without an arm.
         target: Position (3,) [m] of the camera's target, for a view without an arm.
         zoom: Magnification relative to Meshcat's default view angle of 75 degrees.
@@ -63,6 +65,8 @@ def start_meshcat(
     """
     if arm is not None:
         corners = geometry_corners(arm) if poses is None else corners_at(arm, poses)
+        if points is not None:
+            corners = np.vstack([corners, points])
         camera, target = framing(corners, ASPECT if poses is None else REPORT_ASPECT)
     if port is not None and not 1024 <= port <= 65535:
         raise DvrkDrakeError(f"port {port} cannot be opened; allowed: 1024..65535")
