@@ -19,7 +19,7 @@ FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader
 #: Hides the control panel of Meshcat, and the captions, which are too small for a GIF. `label` writes larger ones.
 HIDE_PANEL = ".dg, #captions, #status-message, #stats-plot { display: none !important; }"
 #: Texts on the pictures, with their colours: the arm, and the ghost while it is visible.
-ARM, GHOST = ("grey: identified model, mode guide", "#1f1f1f"), ("green: model of the SDF, mode gravity", "#1b6b40")
+ARM, GHOST = ("blue: identified model, mode guide", "#1f4e9c"), ("green: model of the SDF, mode gravity", "#1b6b40")
 #: Size of the texts, and height of the bar above the view that shows them [px].
 TEXT_SIZE, BAR = 20, 58
 #: Moves the paused animation to a time [s] and draws it.
