@@ -38,9 +38,9 @@ _TRAVEL = 0.008, 0.0008
 #: should move by at most 5 mrad.
 _DEFLECTION = 0.004, 0.0004
 
-#: Largest effort of a spring or of the damping because of one encoder count, as a share of the slip effort. With larger
-#: efforts, a joint oscillates about the edge of a count.
-_COUNT_SHARE = 0.2
+#: Largest effort of a spring or of the damping because of one encoder count, as a share of the slip effort. Both
+#: together are smaller than the dry friction, so one count cannot move a joint. At rest, the play suppresses them.
+_COUNT_SHARE = 0.4
 
 #: Largest effort of the play of a spring of mode "guide", as a share of the dry friction of the joint. The dry friction
 #: then dissipates at least twice the energy that the play creates.
@@ -197,9 +197,8 @@ class GravityPidController(LeafSystem):
         self.DeclareStateOutputPort(name="fault", state_index=fault)
         counts = arm.encoder_counts()
         rest = FILTER_TIME * arm.per_joint(*_REST_SPEED) + _COUNT_RESPONSE * counts
-        travel = arm.per_joint(*_TRAVEL) + 1.5 * counts
         jump = arm.per_joint(*_JUMP) + 3.0 * counts
-        self._constants = np.array([model.feedforward_scale, limits, rest, travel, jump])
+        self._constants = np.array([model.feedforward_scale, limits, rest, jump])
         # Reading one cache entry at each update is faster than reading each parameter.
         self._settings = self.DeclareCacheEntry(
             "settings",
@@ -260,9 +259,10 @@ class GravityPidController(LeafSystem):
         settings.set_value((np.vstack([per_joint, self._constants, *self._springs(*per_joint)]), mode))
 
     def _springs(self, kp: Vector, kd: Vector, ki: Vector, slip: Vector) -> tuple[Vector, ...]:
-        """Returns stiffness and damping of the springs of mode "guide", largest damping of a free joint, and play.
+        """Returns stiffness, travel and damping of the springs of mode "guide", damping of a free joint, and play.
 
-        Without the dry friction, the slip effort is the error of the model, which lets a free joint drift.
+        A spring reaches the slip effort before it breaks away. Without the dry friction, the slip effort is the error
+        of the model, which lets a free joint drift.
         """
         counts = np.maximum(self._arm.encoder_counts(), np.finfo(float).tiny)
         deflection = self._arm.per_joint(*_DEFLECTION)
@@ -270,8 +270,10 @@ class GravityPidController(LeafSystem):
         damping = np.sqrt(np.divide(stiffness, kp, out=np.ones_like(kp), where=kp > 0)) * kd
         damping = np.minimum(damping, _COUNT_SHARE * slip * RATE_TIME / counts)
         dry = self._arm.dry_friction()
-        play = np.minimum(0.5 * counts, _PLAY_SHARE * dry / np.maximum(stiffness, np.finfo(float).tiny))
-        return stiffness, damping, np.maximum(slip - dry, 0.0), play
+        compliance = np.divide(1.0, stiffness, out=np.zeros_like(stiffness), where=stiffness > 0)
+        travel = np.maximum(self._arm.per_joint(*_TRAVEL) + 1.5 * counts, compliance * slip)
+        play = np.minimum(0.5 * counts, _PLAY_SHARE * compliance * dry)
+        return stiffness, travel, damping, np.maximum(slip - dry, 0.0), play
 
     def _make_update(self, holding: HoldingArrays, restart: bool) -> Callable[[Context, DiscreteValues], None]:
         """Returns the handler of an update event.

@@ -47,8 +47,8 @@ def controller_step(
         restart: True for the update at initialization.
         period: Period of the update [s].
         mode: Index into `Mode`.
-        per_joint: Rows (13, n): kp, kd, ki, slip effort, feedforward scale and effort limits, then rest, travel, jump,
-            stiffness, damping, drift and play of `virtual_friction`.
+        per_joint: Rows (13, n): kp, kd, ki, slip effort, feedforward scale and effort limits, then rest, jump,
+            stiffness, travel, damping, drift and play of `virtual_friction`.
         model: Model of the holding torque.
         effort, gravity, fault, integral: Results, which the function writes into these arrays. `fault` has one number.
         latched_q: Pose that is regulated if `has_desired` is False; NaN before the first pose.
@@ -57,8 +57,8 @@ def controller_step(
     """
     n = effort.size
     kp, kd, ki, slip, feedforward_scale = per_joint[0], per_joint[1], per_joint[2], per_joint[3], per_joint[4]
-    limit, rest, travel, jump = per_joint[5], per_joint[6], per_joint[7], per_joint[8]
-    stiffness, damping, drift, play = per_joint[9], per_joint[10], per_joint[11], per_joint[12]
+    limit, rest, jump, stiffness, travel = per_joint[5], per_joint[6], per_joint[7], per_joint[8], per_joint[9]
+    damping, drift, play = per_joint[10], per_joint[11], per_joint[12]
     hold, damped = mode == HOLD, mode == DAMPED
 
     if restart:

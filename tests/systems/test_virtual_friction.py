@@ -130,14 +130,14 @@ def test_spring_attaches_to_a_trembling_hand():
         np.testing.assert_allclose(guided.step(q - 1e-4) - before, 1e-4 * KP, atol=1e-12)
 
 
-def test_one_encoder_count_changes_the_effort_little():
+def test_one_encoder_count_moves_no_joint():
     guided = Guided(IdentifiedModel.from_arm(WITH_ENCODER), slip_efforts=None)
     guided.controller.SetGains(guided.context, WITH_ENCODER.gains)
     guided.rest()
     coarse = np.arange(N) == 6
     for k in range(40):
         added = guided.step(Q + coarse * WITH_ENCODER.encoder_counts() * (k % 2))
-        assert np.all(np.abs(added) <= 0.4 * ARM.dry_friction())  # the spring and the damping
+        assert np.all(np.abs(added) <= 0.8 * ARM.dry_friction())  # the spring and the damping
 
 
 def test_a_joint_at_rest_may_alternate_between_counts():
