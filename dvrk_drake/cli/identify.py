@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter, Token
@@ -134,6 +135,8 @@ def _model_and_recording(
     try:
         read = file.read(recording, loaded.arm, steps)
     except RecordingError as error:
+        if not Path(recording).exists():
+            raise
         # A recording of another arm lacks columns or exceeds limits, and its own message cannot name the cause.
         raise RecordingError(f"{error}. {model} is a model of {loaded.arm.name}") from error
     support.print_notes(recording, read.notes)

@@ -44,7 +44,7 @@ class ArmFrame:
         self._plant = shared_plant(arm)
         if not self._plant.HasFrameNamed(frame_name := frame_name or arm.frames.hand):
             known = ", ".join(dict.fromkeys([*main_frames(arm), arm.frames.hand]))
-            raise ArmError(f'{arm.name}: the SDF has no frame "{frame_name}"; available frames: {known}')
+            raise ArmError(f'{arm.name}: the SDF has no frame "{frame_name}"; available frames: {known}, and all links')
         self._frame = self._plant.GetFrameByName(frame_name)
         self._context = self._plant.CreateDefaultContext()
         # G maps velocities of the independent joints to velocities of the plant.

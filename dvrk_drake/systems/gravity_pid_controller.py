@@ -38,8 +38,9 @@ _TRAVEL = 0.008, 0.0008
 #: should move by at most 5 mrad.
 _DEFLECTION = 0.004, 0.0004
 
-#: Largest effort of a spring or of the damping because of one encoder count, as a share of the slip effort. Both
-#: together are smaller than the dry friction, so one count cannot move a joint. At rest, the play suppresses them.
+#: Largest effort of a spring or of the damping because of one encoder count, as a share of the slip effort. With an
+#: exact model, both together are smaller than the dry friction, so one count cannot move a joint. At rest, the play
+#: suppresses them.
 _COUNT_SHARE = 0.4
 
 #: Largest effort of the play of a spring of mode "guide", as a share of the dry friction of the joint. The dry friction

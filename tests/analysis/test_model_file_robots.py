@@ -82,6 +82,19 @@ def test_presliding_is_uncertain_after_a_reversal(arm):
     np.testing.assert_allclose(np.array(deviations)[[60, 99, 160, 199]], 0.0, atol=1e-9)
 
 
+def test_reversal_share_is_the_error_between_two_travels():
+    """Errors of the best combination of elements with travels 1 and 10/3 for an element with a travel between them."""
+    d, ratios = np.linspace(0, 20 / 3, 2001)[:-1], []  # until both slide
+    short, long = (np.minimum(d / w - 1, 1) for w in (1.0, 10 / 3))
+    for w in (10 / 3) ** np.linspace(0, 1, 41):
+        true = np.minimum(d / w - 1, 1)
+        share = np.clip((short - long) @ (true - long) / np.sum((short - long) ** 2), 0, 1)
+        stated = share * (d < 2) + (1 - share)
+        error = true - share * short - (1 - share) * long
+        ratios.append(np.mean(error**2) / np.mean(stated**2))
+    np.testing.assert_allclose(np.sqrt(np.mean(ratios)), REVERSAL_SHARE, atol=0.01)
+
+
 def test_boxes_without_collision_shapes_are_wider(tmp_path):
     # If a mesh were missing, all shapes would be omitted.
     mesh = (

@@ -68,9 +68,10 @@ def is_assumed(arm: Arm) -> bool:
 def find_mounting(observations: Observations) -> tuple[Arm, list[Finding]]:
     """Returns the arm with the mounting that explains a recording, and findings on the differences.
 
-    Joint zeros are changed one after the other, each with the best direction of gravity, as long as a change makes the
-    efforts much more likely. The mounting is used if the one of the arm is only assumed (`is_assumed`). Otherwise, the
-    returned arm is unchanged, and the findings advise to correct the arm file.
+    Joint zeros are changed one after the other, as long as a change makes the efforts much more likely: once with the
+    stated gravity, and once with the best gravity for each change, which must make the efforts still more likely. The
+    mounting is used if the one of the arm is only assumed (`is_assumed`). Otherwise, the returned arm is unchanged, and
+    the findings advise to correct the arm file.
     """
     arm = observations.arm
     if not observations.recording.motion(arm) and len(observations.recording) < MIN_POSES:
@@ -85,13 +86,12 @@ def find_mounting(observations: Observations) -> tuple[Arm, list[Finding]]:
     search = _Search(fit)
     # Another gravity can hide a zero that is no multiple of 90 degrees, so the stated gravity is also tried.
     (gravity, offsets), free = (_centred(own, arm, *search.best(is_free)) for is_free in (False, True))
-    gain = _log_likelihood(own, _arm_with(arm, gravity, offsets)) - fit.log_likelihood
+    found, gain = _with_gain(own, fit, arm, gravity, offsets)
     if not np.array_equal(free[0], gravity):
-        free_gain = _log_likelihood(own, _arm_with(arm, *free)) - fit.log_likelihood
+        with_free, free_gain = _with_gain(own, fit, arm, *free)
         if free_gain - gain > MIN_CONFIRMED_GAIN:
-            (gravity, offsets), gain = free, free_gain
+            (gravity, offsets), found, gain = free, with_free, free_gain
     scale = list(_scale_findings(arm, search.scale(gravity, offsets))) if has_converted_model(arm) else []
-    found = _arm_with(arm, gravity, offsets)
     if found is arm:
         return arm, scale
     is_used = is_assumed(arm)
@@ -146,8 +146,14 @@ def _arm_with(arm: Arm, gravity: NDArray[np.float64], offsets: NDArray[np.float6
     return arm if np.array_equal(gravity, arm.gravity) else arm.with_gravity(gravity.tolist())
 
 
-def _log_likelihood(observations: Observations, arm: Arm) -> float:
-    return ChannelFit(Observations(observations.recording, _with_wide_limits(arm))).log_likelihood
+def _with_gain(
+    own: Observations, fit: ChannelFit, arm: Arm, gravity: NDArray[np.float64], offsets: NDArray[np.float64]
+) -> tuple[Arm, float]:
+    """Returns the arm with another mounting, or `arm` if it is the same, and its gain in log-likelihood over `fit`."""
+    other = _arm_with(arm, gravity, offsets)
+    if other is arm:
+        return arm, 0.0
+    return other, ChannelFit(Observations(own.recording, _with_wide_limits(other))).log_likelihood - fit.log_likelihood
 
 
 def _findings(arm: Arm, gravity: NDArray[np.float64], offsets: NDArray[np.float64], is_used: bool) -> Iterator[Finding]:
