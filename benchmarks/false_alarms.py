@@ -148,7 +148,7 @@ def main():
     parser = ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=30.0, help="total simulated time [min]; default: 30")
     parser.add_argument("--processes", type=int, default=2, help="number of parallel processes; default: %(default)s")
-    parser.add_argument("--uses", nargs="+", default=list(USES), help="uses to simulate")
+    parser.add_argument("--uses", nargs="+", default=list(USES), choices=USES, metavar="USE", help="uses; default: all")
     arguments = parser.parse_args()
     weight = sum(USES[use][-1] for use in arguments.uses)
     tasks = [(use, 60.0 * arguments.minutes * USES[use][-1] / weight) for use in arguments.uses]
