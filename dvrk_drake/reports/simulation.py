@@ -28,22 +28,25 @@ def simulation_page(simulation: Simulation, arm: Arm, *, scenario: str | None = 
             command has already written figures.
     """
     recording, desired = simulation.recording, simulation.desired
-    error = np.abs(recording.q - (recording.q[:1] if desired is None else desired))
+    # In mrad or mm: errors of a controlled arm are small.
+    error = 1e3 * np.abs(recording.q - (recording.q[:1] if desired is None else desired))
     effort = np.abs(recording.measured_effort()).max(axis=0)
-    j = int(np.argmax(error.max(axis=0) / (arm.position_upper - arm.position_lower)))
+    range_share = 1e-3 * error.max(axis=0) / (arm.position_upper - arm.position_lower)
+    j = int(np.argmax(range_share))
     what = "Largest motion from the start" if desired is None else "Largest tracking error"
     kind = "motion" if desired is None else "error"
-    unit = length_unit(arm, j)
+    unit = f"m{length_unit(arm, j)}"
     rows = []
     for i, name in enumerate(arm.joint_names):
         share = f"{100 * effort[i] / arm.effort_limits[i]:.0f} %"
-        rows.append((name, f"{error[:, i].max():.5f}", f"{error[-1, i]:.5f}", f"{effort[i]:.4f}", share))
+        rows.append((name, f"{error[:, i].max():.2f}", f"{error[-1, i]:.2f}", f"{effort[i]:.4f}", share))
     title = f"{arm.name}, simulated for {simulation.time[-1]:g} s"
     header = ("", f"largest {kind}", f"{kind} at the end", "largest effort", "effort / limit")
-    table = Table(header, rows, f"{title} [rad, N m; m, N if prismatic]")
+    table = Table(header, rows, f"{title} [mrad, N m; mm, N if prismatic]")
+    largest = f"{error[:, j].max():.2f} {unit} ({arm.joint_names[j]}, {100 * range_share[j]:.2g} % of its range)"
     return Page(
         title,
-        f"{what} {error[:, j].max():.2g} {unit} ({arm.joint_names[j]}), at the end {error[-1, j]:.2g} {unit}.",
+        f"{what} relative to the range of the joint: {largest}, at the end {error[-1, j]:.2f} {unit}.",
         [Section("Joints", [table, _plot(simulation, arm)])],
         "good",
         f"dvrk-drake simulate {scenario} --plots FOLDER" if scenario else "",
