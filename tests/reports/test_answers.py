@@ -161,9 +161,9 @@ CASES = {
         r"Poses with a torque at limit, runaway or opposed: [1-9][\d.]* %",
         compared,
     ),
-    "simulate, hold": (r"Largest tracking error relative to the range .*: \S+ \w+ \(\w+, \S+ %", lambda c, v: simulated(c, v, [])),
+    "simulate, hold": (r"Largest tracking error .*: \S+ \w+ \(\w+, \S+ %", lambda c, v: simulated(c, v, [])),
     "simulate, gravity": (
-        r"Largest motion from the start relative to the range .*: \S+ \w+ \(\w+, \S+ %",
+        r"Largest motion from the start .*: \S+ \w+ \(\w+, \S+ %",
         lambda c, v: simulated(c, v, ["controller.mode=gravity"]),
     ),
     "study": (
