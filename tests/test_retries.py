@@ -100,13 +100,3 @@ def test_end_of_the_process_fails_the_test(tmp_path):
     done = run(path)
     assert done.returncode == 1
     assert "the process of the test ended: -6" in done.stdout and "1 failed, 1 passed" in done.stdout
-
-
-def test_run_ends_when_a_worker_of_the_tests_dies(tmp_path):
-    """The options are those of the Makefile."""
-    path = tmp_path / "test_some.py"
-    path.write_text("import os, time\ndef test_end(): os.abort()\ndef test_next(): time.sleep(0.1)\n")
-    options = re.search(r"pytest (-n 2 .*) -m", (ROOT / "Makefile").read_text())[1]
-    done = run(path, "-p", "xdist", *options.split())
-    assert done.returncode == 1
-    assert "test_end" in done.stdout and "crashed" in done.stdout

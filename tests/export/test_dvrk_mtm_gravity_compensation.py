@@ -25,7 +25,6 @@ from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_c
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import (
     GravityCompensationFile,
     controller_torque,
-    unclipped_torque,
 )
 from dvrk_drake.export.gravity_compensation_loss import LEAST_TOLERANCE, accepted_differences
 from dvrk_drake.models.arm_files import load_arm
@@ -131,27 +130,6 @@ def test_file_gives_the_torque_of_the_model(name, tmp_path):
     assert np.ptp(expected, axis=0)[1:6].min() > 0.01  # The torques are large enough for a comparison.
     actual = np.array([dvrk_controller(path, pose, np.zeros(7)) for pose in q])
     np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-10)
-
-
-def test_torque_of_a_file_equals_that_of_the_controller(tmp_path):
-    generator = np.random.default_rng(4)
-    file = GravityCompensationFile(
-        positive=generator.normal(0, 0.1, 40),
-        negative=generator.normal(0, 0.1, 40),
-        torque_lower=np.full(7, -0.3),
-        torque_upper=np.array([0.4, 0.5, 0.3, 0.2, 0.1, 0.1, 0.0]),
-        dead_band=np.full(7, 0.02),
-        saturation=np.full(7, 0.4),
-        friction_ratio=generator.uniform(0, 1, 7),
-    )
-    path = tmp_path / "gc.json"
-    file.save(path, "MTML", "test")
-    file = GravityCompensationFile.load(path)
-    q, v = generator.uniform(-1, 1, (300, 7)), generator.uniform(-0.6, 0.6, (300, 7))
-    v[:100] *= 0.03  # Many speeds are inside the dead band.
-    expected = np.array([dvrk_controller(path, *row) for row in zip(q, v, strict=True)])
-    np.testing.assert_allclose(controller_torque(file, q, v), expected, rtol=0, atol=1e-12)
-    assert np.abs(unclipped_torque(file, q, v) - expected).max() > 0.1  # Some torques are clipped.
 
 
 def test_friction_is_half_the_difference_of_the_directions(tmp_path):

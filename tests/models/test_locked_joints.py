@@ -76,13 +76,6 @@ def test_dynamics_are_those_of_the_full_arm(name, locked):
     np.testing.assert_allclose(ours.mass_matrix(motion[0], ours.values), M, atol=1e-9)
 
 
-@pytest.mark.parametrize(("name", "locked"), CASES)
-def test_holding_torque_is_that_of_the_full_arm(name, locked):
-    full, arm, free, (q, *_), (Q, *_) = both(name, locked)
-    ours, reference = IdentifiedModel.from_arm(arm), IdentifiedModel.from_arm(full)
-    np.testing.assert_allclose(ours.holding_torque(q), reference.holding_torque(Q)[:, free], atol=1e-9)
-
-
 def test_plant_has_the_locked_positions():
     full, arm, _, (q, *_), (Q, *_) = both("psm", WRIST, 1)
     plant = make_arm_plant(full)

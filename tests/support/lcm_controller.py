@@ -1,9 +1,8 @@
 """Controller process for tests that regulates the first received pose of the arm with effort commands.
 
-    python lcm_controller.py ARM [--echo] [--clock-jump SECONDS] [--lcm-url URL]
+    python lcm_controller.py ARM [--echo] [--lcm-url URL]
 
-With --echo, the process only answers with HOLD commands. With --clock-jump, its clock jumps by the given time at the
-1000th command. The process uses real-time scheduling if that is permitted.
+With --echo, the process only answers with HOLD commands. It uses real-time scheduling if that is permitted.
 """
 
 import sys
@@ -19,8 +18,8 @@ from dvrk_drake.systems.lcm.messages import draw_id
 
 
 class Controller:
-    def __init__(self, arm_name: str, echo: bool, clock_jump: float, url: str) -> None:
-        self.arm, self.echo, self.clock_jump = load_arm(arm_name), echo, clock_jump
+    def __init__(self, arm_name: str, echo: bool, url: str) -> None:
+        self.arm, self.echo = load_arm(arm_name), echo
         self.kp, self.kd = np.array(self.arm.gains.kp), np.array(self.arm.gains.kd)
         self.sender_id, self.sequence = draw_id(), 0
         self.held = None
@@ -36,21 +35,15 @@ class Controller:
         self.sequence += 1
         effort = effort + self.kp * (q_held - q) - self.kd * v
         command = effort_command(status, effort, self.sender_id, self.sequence)
-        if self.sequence >= 1000:
-            command.utime += round(1e6 * self.clock_jump)
         if self.echo:
             command.control_mode = lcmt_dvrk_command.HOLD
         self.lcm.publish(f"DVRK_COMMAND_{self.arm.name}", command.encode())
 
 
 def main(arguments: list[str]) -> None:
-    def option(name: str, default: str) -> str:
-        return arguments[arguments.index(name) + 1] if name in arguments else default
-
     make_realtime()  # before LCM starts its reading thread
-    controller = Controller(
-        arguments[0], "--echo" in arguments, float(option("--clock-jump", "0")), option("--lcm-url", "")
-    )
+    url = arguments[arguments.index("--lcm-url") + 1] if "--lcm-url" in arguments else ""
+    controller = Controller(arguments[0], "--echo" in arguments, url)
     while True:
         controller.lcm.handle()
 

@@ -16,7 +16,6 @@ from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import tree_selector
 from dvrk_drake.systems.arm_station import ArmStation, arm_plant_config, station_ports
-from dvrk_drake.systems.arm_view.page import start_meshcat
 
 pytestmark = pytest.mark.drake_api
 
@@ -170,17 +169,6 @@ def test_disturbance_is_not_clamped():
     assert disturbed[0] > 5 * commanded[0] > 0
 
 
-def test_unconnected_inputs_are_zero_effort():
-    q = POSES[2]
-    unconnected = acceleration_of(ArmStation(ARM), q, {})
-    zero = {"mtml.effort_commanded": np.zeros(N), "mtml.effort_disturbance": np.zeros(N)}
-    limp = acceleration_of(ArmStation(ARM), q, zero)
-    np.testing.assert_allclose(unconnected, limp, rtol=0, atol=1e-9 * np.abs(limp).max())
-    station = ArmStation(ARM)
-    context = station.CreateDefaultContext()
-    np.testing.assert_array_equal(station.GetOutputPort("mtml.effort_measured").Eval(context), np.zeros(N))
-
-
 def test_measurements_are_the_state_of_the_independent_joints():
     station = ArmStation(ARM)
     context = station.CreateDefaultContext()
@@ -275,10 +263,3 @@ def test_errors_state_the_remedy():
     station = ArmStation(ARM)
     with pytest.raises(StationError, match="a pose of MTML is 7 finite numbers"):
         station.SetPositions(station.CreateDefaultContext(), np.zeros(6))
-
-
-def test_meshcat_shows_the_arm():
-    meshcat = start_meshcat()
-    diagram = ArmStation(ARM, meshcat=meshcat)
-    diagram.ForcedPublish(diagram.CreateDefaultContext())
-    assert meshcat.HasPath("/drake/mtml/links")

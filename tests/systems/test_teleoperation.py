@@ -324,18 +324,6 @@ def test_simulated_follower_follows_the_hand(arms):
     assert angle(T.rotation() @ T0.rotation().inverse() @ wanted.inverse()) < 5e-3
 
 
-def test_master_and_follower_stay_without_a_hand(arms):
-    simulator = Simulator(arms)
-    context = simulator.get_mutable_context()
-    arms.SetPositions(context, START_MASTER, START_FOLLOWER)
-    arms.GetInputPort("engaged").FixValue(context, [1.0])
-    simulator.AdvanceTo(1.0)
-    q_M = arms.GetOutputPort("mtml.state_estimated").Eval(context)[:7]
-    q_F = arms.GetOutputPort("psm.state_estimated").Eval(context)[:7]
-    np.testing.assert_allclose(q_M, START_MASTER, atol=1e-4)
-    np.testing.assert_allclose(q_F, START_FOLLOWER, atol=1e-4)
-
-
 def test_pose_is_constant_outside_the_trajectory():
     ends = [RigidTransform([0.0, 0, 0]), RigidTransform([2.0, 0, 0])]
     source = PoseTrajectorySource(PiecewisePose.MakeLinear([1.0, 2.0], ends))

@@ -5,7 +5,6 @@ The bridge continues. It commands only within limits, and no efforts while anoth
 
 import os
 import threading
-import time
 
 import numpy as np
 import pytest
@@ -24,7 +23,7 @@ os.environ.setdefault("CYCLONEDDS_URI", DOMAIN_FILE)
 
 
 class BadArm:
-    """Publishes valid measurements of an enabled arm at 1 kHz in a thread, and bad messages in between."""
+    """Publishes valid measurements of an enabled arm at 1 kHz in a thread."""
 
     def __init__(self):
         from dvrk_drake.systems.ros import messages as m
@@ -41,13 +40,10 @@ class BadArm:
             for name, kind in topics.items()
         }
         self.monitor = CommandMonitor(self.domain, "/MTML")
-        self.ended, self.change = threading.Event(), lambda message: message
+        self.ended = threading.Event()
         self.set_state("ENABLED")
         self.thread = threading.Thread(target=self._run, daemon=True)
         self.thread.start()
-
-    def has_other_publisher(self, name):
-        return any(e.topic == f"/MTML/{name}" and not e.is_own for e in self.domain.publishers())
 
     def set_state(self, state, is_homed=True):
         message = self.m.OperatingState(self.m.Header.now(), state, is_homed, False)
@@ -57,7 +53,7 @@ class BadArm:
         zeros = [0.0] * len(POSE)
         while not self.ended.wait(0.001):
             message = self.m.JointState(self.m.Header.now(), list(NAMES), list(POSE), zeros, zeros)
-            self.publishers["measured_js"].publish(self.change(message))
+            self.publishers["measured_js"].publish(message)
             off = self.m.JointState(self.m.Header.now(), list(NAMES), [], [], zeros)
             self.publishers["gravity_compensation/setpoint_js"].publish(off)
 
@@ -73,53 +69,10 @@ def arm():
     arm.end()
 
 
-def changed(**fields):
-    def change(message):
-        for name, value in fields.items():
-            setattr(message, name, value)
-        return message
-
-    return change
-
-
-def jumped(seconds):
-    def change(message):
-        message.header.stamp.sec += seconds
-        return message
-
-    return change
-
-
-BAD = [
-    (changed(position=POSE[:6]), "/MTML/measured_js has 6 positions, 7 velocities and 7 efforts; required: 7 each"),
-    (changed(position=[*POSE, 0.0]), "/MTML/measured_js has 8 positions, 7 velocities and 7 efforts; required: 7 each"),
-    (changed(velocity=[float("nan")] * 7), "/MTML/measured_js: a position or velocity is not finite"),
-    (changed(name=["x", *NAMES[1:]]), "MTML also needs outer_yaw"),
-    (changed(name=[], position=[], velocity=[], effort=[]), "/MTML/measured_js has the joints none; MTML also needs"),
-    (jumped(3600), "/MTML/measured_js: the time stamp changed by 3600."),
-    (jumped(-7200), "/MTML/measured_js: the time stamp changed by -"),
-]
-
-
 def test_bad_and_random_messages_do_not_end_the_bridge(arm, tmp_path):
-    arm.change = changed(position=[])
     operator, bridge = Operator("mtml"), start_bridge("mtml", tmp_path)
     try:
-        # The bridge waits for a valid measurement.
-        wait_until(lambda: arm.has_other_publisher("servo_jf"), "connection", bridge)
-        arm.change = lambda message: message
         wait_until(lambda: arm.monitor.first(["servo_jp"], 0), "first command", bridge)
-        operator.reset(bridge)  # on a busy computer, measurements may be late
-        for change, line in BAD:
-            length, arm.change = len(bridge.output()), change
-            wait_for_line(bridge, line, after=length)
-            arm.change = lambda message: message
-            count = len(operator.received)
-            wait_until(lambda count=count: len(operator.received) > count + 50, "statuses", bridge)
-            operator.reset(bridge)
-            # The bridge reports at most one problem per second.
-            end = time.monotonic() + 1.1
-            wait_until(lambda end=end: time.monotonic() > end, "time until the next report", bridge)
         send_random_messages(arm)
         arm.set_state("ENABLED")
         count = len(operator.received)

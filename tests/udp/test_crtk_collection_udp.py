@@ -113,7 +113,7 @@ def test_holding_torques_with_friction(tmp_path):
     assert np.all(np.abs(recording.q - POSES) < MTML.dry_friction() / np.asarray(MTML.gains.kp) + 2e-3)
     expected = np.array([truth.holding_torque(q) for q in recording.q])
     # The friction at rest never exceeds the dry friction. How far it cancels depends on the speed of the simulated arm,
-    # and thus on the load of the computer. `tests/processes/test_crtk_collector.py` tests it.
+    # and thus on the load of the computer.
     assert np.all(np.abs(recording.tau - expected) < MTML.dry_friction() + 1e-3)
     bag = read_recording(tmp_path / "p_1.mcap", MTML)
     assert np.all(np.min(np.linalg.norm(bag.q[:, None] - recording.q, axis=2), axis=0) < 0.01)

@@ -14,7 +14,7 @@ import lcm
 import lcm_controller
 import numpy as np
 import pytest
-from arm_observer import NETWORK_URL, Observer, accepts_efforts, check_clock, is_holding
+from arm_observer import Observer, accepts_efforts, check_clock, is_holding
 from arm_processes import (
     LONG_TIMEOUT_DRIVER,
     POSES,
@@ -335,24 +335,6 @@ def test_invalid_messages_neither_stop_nor_move_the_arm(arm, count):
     assert drift(*received) < 1e-4
 
 
-def test_controller_clock_jump_leads_to_hold_and_restart(arm):
-    name, _, observer = arm
-    first = len(observer.received)
-    controller = start_controller(name, "--clock-jump", {"mtml": "10", "psm": "-10"}[name])
-    try:
-        begun = observer.until(accepts_efforts, "start of the controller", process=controller)
-        jumped = observer.until(
-            lambda status: status.refusal_code == Status.REFUSAL_CLOCK_JUMP, "refusal", begun, controller
-        )
-        # The last good command expires first.
-        held = observer.until(is_holding, "hold", jumped, controller)
-        observer.until(accepts_efforts, "a new start", held, controller)
-        observer.during(0.2)
-    finally:
-        controller.end()
-    assert drift(*observer.received[first:]) < 1e-3
-
-
 class Logged:
     """Records the commands with lcm-logger while the block runs, for lcm-logplayer."""
 
@@ -382,29 +364,6 @@ class Logged:
     def play(self):
         command = [LCM_TOOLS / "lcm-logplayer", f"--speed={SLOWLY}", "-l", self.url, self.path]
         subprocess.run(command, check=True, timeout=TIMEOUT, capture_output=True)
-
-
-def test_replayed_commands_of_a_log_are_refused(arm, tmp_path):
-    name, _, observer = arm
-    with Logged(tmp_path / "commands", NETWORK_URL) as log:
-        controller = start_controller(name)
-        try:
-            begun = observer.until(accepts_efforts, "start of the controller", process=controller)
-            accepted = observer.received[begun].num_accepted
-            observer.until(lambda status: status.num_accepted > accepted + 500, "500 commands", process=controller)
-        finally:
-            controller.end()
-        observer.until(is_holding, "hold")
-    before, first = observer.last, len(observer.received)
-    assert log.count(name) > 50
-    log.play()
-    enough = before.num_refused + 0.9 * log.count(name)
-    observer.until(lambda status: status.num_refused > enough, "refusals", first)
-    received = observer.received[first:]
-    assert all(map(is_holding, received))
-    assert received[-1].num_accepted == before.num_accepted
-    assert received[-1].refusal_code == Status.REFUSAL_STALE
-    assert drift(*received) < 1e-3
 
 
 @pytest.mark.watchdog
@@ -515,27 +474,6 @@ def test_run_ignores_foreign_statuses_and_ends_on_silence(ends):
     assert re.search(rf"; ignored: \d+ {most}", said), said
     assert {command.session_id for command in arm.commands} == {session}
     assert all(command.status_utime <= 10**15 + 600_000_000 for command in arm.commands)
-
-
-@pytest.mark.watchdog
-def test_first_of_two_controllers_stays_in_control(arm):
-    name, _, observer = arm
-    first = start_controller(name)
-    second = None
-    try:
-        begun = observer.until(accepts_efforts, "start of the controller", process=first)
-        sender = observer.received[begun].command_sender_id
-        second = start_controller(name)
-        ignored = observer.last.num_ignored
-        last = observer.until(lambda status: status.num_ignored > ignored + 500, "the second controller", begun, second)
-    finally:
-        first.end()
-        if second is not None:
-            second.end()
-    received = observer.received[begun : last + 1]
-    assert {(status.guard_state, status.command_sender_id) for status in received} == {(Status.STATE_EFFORT, sender)}
-    assert received[-1].ignored_code == Status.REFUSAL_OTHER_SENDER
-    assert drift(*received) < 1e-3
 
 
 def speed(observer, what, condition):

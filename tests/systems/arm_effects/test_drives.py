@@ -77,16 +77,6 @@ def test_velocity_is_low_pass_of_count_differences():
     assert np.abs(v[:3] - run.v[:3]).max() < 0.3 * np.abs(run.v[:3]).max()
 
 
-def test_arm_at_rest_measures_zero_velocity():
-    arm = weightless("mtml")
-    for delay in (None, DelayEffect(measurement=3)):
-        run = Run(arm, ArmEffects(encoder=arm.effects.encoder, delay=delay), q=np.full(7, 0.2))
-        for _ in range(10):
-            assert np.abs(run.get("position_measured") - 0.2).max() < 6e-3
-            np.testing.assert_allclose(run.get("velocity_estimated"), 0.0, atol=1e-9)
-            run.advance()
-
-
 @pytest.mark.parametrize("name", ARMS)
 def test_each_motor_saturates_at_its_limit(name):
     arm = load_arm(name)

@@ -22,72 +22,7 @@ def at(q=Q):
     return follower
 
 
-def test_off_and_hold_output_zero_velocity_and_effort():
-    follower = at()
-    for output, mode, position in ((follower.off(Q + 1), Command.OFF, Q + 1), (follower.hold(1e-3), Command.HOLD, Q)):
-        assert output.control_mode == mode
-        np.testing.assert_array_equal(output.position, position)
-        for zero in (output.velocity, output.effort, output.joint_flags):
-            np.testing.assert_array_equal(zero, STILL)
-            zero[:] = 1
-        output.position[:] = 9.0
-    np.testing.assert_array_equal(follower.hold(1e-3).position, Q)
-    np.testing.assert_array_equal(follower.hold(1e-3).velocity, STILL)
-    np.testing.assert_array_equal(follower.hold(1e-3).effort, STILL)
-    assert np.all(Follower(LIMITS, SAFE_GAINS).hold(1e-3).position == 0.0)
-
-
-@pytest.mark.parametrize("joint", range(N))
-@pytest.mark.parametrize("side", [-1, 1])
-def test_is_near_uses_start_tolerance_of_every_joint(joint, side):
-    away = side * LIMITS.start_position[joint] * E[joint]
-    assert at().is_near(Q + 0.999 * away)
-    assert not at().is_near(Q + 1.001 * away)
-
-
-def test_is_near_includes_the_exact_tolerance():
-    follower = at(STILL)
-    follower.begin_position()
-    assert follower.is_near(LIMITS.start_position)
-    assert follower.following_fault(LIMITS.following_error) == ""
-
-
 # Positions
-
-
-def test_target_follows_command_at_limited_rate():
-    follower = at()
-    follower.begin_position()
-    goal = Q + 0.02
-    for k in range(1, 4):
-        output = follower.follow_position(goal, STILL, 1e-3)
-        expected = np.minimum(k * 1e-3 * LIMITS.speed, 0.02)
-        np.testing.assert_allclose(output.position - Q, expected, atol=1e-12)
-        np.testing.assert_array_equal(follower.target, output.position)
-        np.testing.assert_array_equal(output.joint_flags != 0, expected < 0.02)
-    assert output.control_mode == Command.POSITION
-    np.testing.assert_array_equal(output.effort, STILL)
-    output = follower.follow_position(goal, 0.01 * LIMITS.speed, 1.0)
-    np.testing.assert_allclose(output.position, goal, atol=1e-12)
-    np.testing.assert_allclose(output.velocity, 0.01 * LIMITS.speed, atol=1e-12)
-    # A change of the output does not change the target.
-    output.position[:] = 9.0
-    np.testing.assert_allclose(follower.hold(1e-3).position, goal, atol=1e-12)
-
-
-@pytest.mark.parametrize("joint", range(N))
-@pytest.mark.parametrize("side", [-1, 1])
-def test_large_following_error_is_detected(joint, side):
-    follower = at()
-    follower.begin_position()
-    away = side * 0.15 * RANGE[joint] * E[joint]
-    assert follower.following_fault(Q + 0.999 * away) == ""
-    text = follower.following_fault(Q + 1.001 * away)
-    assert text.startswith(f"{ARM.joint_names[joint]} is at ")
-    assert text.endswith(f"(allowed difference {0.15 * RANGE[joint]:.3g} rad)")
-    # The joint with the largest error is reported.
-    other = (joint + 1) % N
-    assert follower.following_fault(Q + 1.1 * away + 0.5 * RANGE[other] * E[other]).startswith(ARM.joint_names[other])
 
 
 @pytest.mark.parametrize("side", [-1, 1])
@@ -165,46 +100,7 @@ def test_fault_holds_valid_joints_with_bounded_effort(side):
     np.testing.assert_array_equal(output.position, q)
 
 
-def test_fault_gives_invalid_joints_gravity_effort():
-    valid = np.arange(N) != 3
-    output = at().hold_valid_joints(Q - 9.0, STILL + 9.0, valid, 0.1 * LIMIT, 1.0)
-    assert output.effort[3] == pytest.approx(0.1 * LIMIT[3])
-    np.testing.assert_array_equal(output.joint_flags, np.where(valid, 0, Status.FLAG_IMPLAUSIBLE))
-
-
-@pytest.mark.parametrize("side", [-1, 1])
-def test_safe_state_starts_from_present_effort_at_limited_rate(side):
-    follower, step = at(), LIMIT * 1e-3 / GuardSettings().effort_rise_time
-    follower.begin_safe_state(9.0 * side * LIMIT)
-    for k in (1, 2):
-        output = follower.hold_valid_joints(Q, STILL, np.ones(N, bool), STILL, 1e-3)
-        np.testing.assert_allclose(output.effort, side * (LIMIT - k * step), atol=1e-12)
-        output.effort[:] = 9.0
-
-
 # Efforts
-
-
-def test_efforts_start_at_measured_ones_at_limited_rate():
-    follower, measured = at(), LIMIT * [0.3, -0.3, 0.0, 1.2, -1.2, 0.1, 0.0]
-    follower.begin_effort(measured, Q)
-    start = np.clip(measured, -LIMIT, LIMIT)
-    np.testing.assert_allclose(follower.follow_effort(start, Q, STILL, 1e-3, 0.0).effort, start, atol=1e-12)
-    output = follower.follow_effort(start - 0.1 * LIMIT, Q, STILL, 1e-3, 0.5)
-    np.testing.assert_allclose(output.effort, np.maximum(start - 0.05 * LIMIT, -LIMIT), atol=1e-12)
-    output = follower.follow_effort(start - 0.1 * LIMIT, Q, STILL, 1e-3, 1.0)
-    np.testing.assert_allclose(output.effort, np.maximum(start - 0.1 * LIMIT, -LIMIT), atol=1e-12)
-    assert output.control_mode == Command.EFFORT
-    np.testing.assert_array_equal(output.position, Q)
-    np.testing.assert_array_equal(output.velocity, STILL)
-
-
-def test_effort_start_is_clamped_to_effort_fraction():
-    follower = Follower(GuardLimits(ARM, GuardSettings(effort_fraction=0.2)), SAFE_GAINS)
-    follower.begin_effort(0.25 * LIMIT, Q)
-    np.testing.assert_allclose(follower.follow_effort(LIMIT, Q, STILL, 1e-3, 0.0).effort, 0.2 * LIMIT, atol=1e-12)
-    follower.begin_effort(-0.25 * LIMIT, Q)
-    np.testing.assert_allclose(follower.follow_effort(-LIMIT, Q, STILL, 1e-3, 0.0).effort, -0.2 * LIMIT, atol=1e-12)
 
 
 @pytest.mark.parametrize("side", [-1, 1])
@@ -237,13 +133,3 @@ def test_start_inside_wall_never_pulls_outward(side):
     brake = LIMITS.restrain_effort(STILL, Q, fast)[0]
     assert side * brake[0] < 0
     np.testing.assert_array_equal(follower.follow_effort(STILL, Q, fast, 1e-3, 0.0).effort, brake)
-
-
-def test_flags_of_commands_and_walls_are_combined():
-    q = Q.copy()
-    q[0] = ARM.position_upper[0]
-    follower = at(q)
-    follower.begin_effort(STILL, q)
-    flags = follower.follow_effort(2 * LIMIT * E[0], q, STILL, 1e-3, 1.0).joint_flags
-    assert flags[0] == Status.FLAG_EFFORT_CLAMPED | Status.FLAG_RATE_LIMITED | Status.FLAG_POSITION_LIMIT
-    assert not np.any(flags[1:])

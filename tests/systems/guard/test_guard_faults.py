@@ -11,15 +11,6 @@ from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.guard.settings import GuardSettings
 
 
-def test_fault_accepts_only_hold():
-    bench = Bench().started()
-    bench.guard.report_fault("the amplifier is hot")
-    assert bench.guard.accepted_modes == modes(Command.HOLD)
-    for _ in range(400):
-        assert bench.send() == Status.REFUSAL_FAULT
-        assert bench.tick().control_mode == Command.HOLD
-
-
 def test_reset_requires_a_change_of_the_flag():
     bench = Bench(modes=WITH_OFF)
     bench.guard.report_fault("the amplifier is hot")
@@ -29,7 +20,8 @@ def test_reset_requires_a_change_of_the_flag():
     bench.run(Command.HOLD, 5)
     assert bench.guard.state == Status.STATE_FAULT
     assert bench.send(Command.EFFORT, reset_fault=True) == Status.REFUSAL_BAD_RESET
-    assert bench.send(Command.OFF) == Status.REFUSAL_FAULT
+    assert bench.guard.accepted_modes == modes(Command.HOLD)
+    assert bench.send(Command.OFF) == bench.send(Command.EFFORT) == Status.REFUSAL_FAULT
     bench.tick(500)
     assert bench.guard.state == Status.STATE_FAULT
     bench.run(Command.HOLD, 1)
@@ -92,14 +84,6 @@ def test_pose_beyond_limit_faults_in_effort_mode():
     bench.run(Command.HOLD, 1)
     bench.run(Command.HOLD, 1, reset_fault=True)
     assert bench.send(Command.EFFORT) == Status.REFUSAL_START_OUTSIDE
-
-
-def test_pose_beyond_coupled_limit_faults():
-    bench = Bench().started()
-    bench.q = Q.copy()
-    bench.q[1:3] = 0.2, -0.2 - 0.36  # each joint inside its own range
-    bench.tick()
-    assert bench.guard.fault_text == "parallelogram is at -0.36 rad, outside its limits -0.33..0.68 rad"
 
 
 BAD = GuardSettings().plausibility.bad_samples
@@ -305,14 +289,6 @@ def test_implausible_first_pose_is_a_fault():
     assert guard.state == Status.STATE_HOLD
     np.testing.assert_array_equal(bench.tick().position, Q)
     bench.started()
-
-
-def test_first_pose_slightly_beyond_limit_is_held():
-    q = Q.copy()
-    q[0] = ARM.position_upper[0] + 0.4 * (ARM.position_upper[0] - ARM.position_lower[0])
-    bench = Bench(q=q)
-    assert bench.guard.state == Status.STATE_HOLD
-    np.testing.assert_array_equal(bench.output.position, q)
 
 
 def gap(bench):

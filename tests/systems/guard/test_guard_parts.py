@@ -1,5 +1,7 @@
 """Unit tests of measurements, command streams and settings at the edges of the accepted ranges."""
 
+import re
+from dataclasses import fields
 from itertools import product
 
 import numpy as np
@@ -9,6 +11,7 @@ from guard_bench import Bench
 from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
+from dvrk_drake.models.ranges import RANGE
 from dvrk_drake.processes.live_status import LiveStatusMaker
 from dvrk_drake.systems.driver import DvrkDriver
 from dvrk_drake.systems.guard.command_stream import CommandStream, is_finite
@@ -258,110 +261,51 @@ def test_forget_discards_the_sender():
 
 # Settings
 
-#: Defaults and bounds of all settings. A change of one of them is a decision about safety, which this test shows.
-SETTINGS = {
-    "expiry": (0.002, 0.05, 1.0),
-    "command_age": (0.002, 0.015, 1.0),
-    "measurement_age": (0.001, 0.02, 0.1),
-    "start_time": (0.05, 0.25, 10.0),
-    "clock_tolerance": (0.001, 0.05, 1.0),
-    "sequence_jump": (1, 1000, 100_000),
-    "start_effort": (0.001, 0.1, 0.25),
-    "margin": (0.001, 0.05, 0.3),
-    "margin_fraction": (0.001, 0.05, 0.25),
-    "effort_fraction": (0.01, 1.0, 1.0),
-    "effort_rise_time": (0.002, 0.02, 10.0),
-    "traverse_time": (0.1, 0.5, 100.0),
-    "following_error": (0.01, 0.15, 0.5),
-    "following_time": (0.01, 0.2, 1.0),
-    "fault_effort": (0.05, 0.3, 1.0),
-    "slow_period": (0.001, 0.005, 0.02),
-    "longest_period": (0.005, 0.04, 1.0),
-    "oscillation": (0.05, 0.4, 1.0),
-    "oscillation_reversals": (1.0, 4.0, 100.0),
-    "oscillation_time": (0.1, 2.0, 10.0),
-}
-PLAUSIBILITY_SETTINGS = {
-    "position_tolerance": (0.001, 0.01, 0.1),
-    "jitter": (0.0, 0.03, 0.1),
-    "velocity_delay": (0.001, 0.03, 0.1),
-    "velocity_counts": (0.0, 150.0, 2000.0),
-    "velocity_memory": (0.05, 0.15, 2.0),
-    "velocity_scale": (0.0, 0.15, 1.0),
-    "frozen_effort": (0.02, 0.15, 1.0),
-    "frozen_deflection": (0.001, 0.01, 1.0),
-    "frozen_time": (0.002, 0.03, 1.0),
-    "frozen_speed": (0.001, 0.1, 10.0),
-    "response": (0.2, 1.3, 5.0),
-    "hand_effort": (0.0, 0.06, 5.0),
-    "opposed_effort": (0.05, 0.1, 5.0),
-    "response_time": (0.005, 0.03, 0.5),
-    "response_memory": (0.02, 0.2, 10.0),
-    "start_gravity": (0.02, 0.1, 2.0),
-    "tracking_error": (0.01, 0.1, 1.0),
-    "tracking_scale": (0.0, 0.25, 1.0),
-    "tracking_time": (0.01, 0.1, 1.0),
-    "zero_time": (0.002, 0.02, 1.0),
-    "detection_time": (0.005, 0.03, 0.5),
-}
+
+def of_a_check(name, value):
+    """Returns settings in which a setting of the plausibility checks has the value."""
+    return GuardSettings(plausibility=PlausibilitySettings(**{name: value}))
 
 
-@pytest.mark.parametrize("name", SETTINGS)
-def test_each_setting_has_a_default_and_bounds(name):
-    lowest, default, highest = SETTINGS[name]
-    assert getattr(GuardSettings(), name) == default
-    for value in (lowest, highest):
-        assert getattr(GuardSettings(**{name: value}), name) == value
-    for value in (np.nextafter(lowest, 0.0), np.nextafter(highest, np.inf), np.nan):
-        with pytest.raises(StationError, match=f"guard settings: {name} is .*; allowed: {lowest:g}..{highest:g}"):
-            GuardSettings(**{name: value})
+def numbers(schema):
+    """Returns each number of a schema: name, default and range."""
+    return [(f.name, f.default, f.metadata[RANGE]) for f in fields(schema) if type(f.default) in (int, float)]
 
 
-@pytest.mark.parametrize("name", PLAUSIBILITY_SETTINGS)
-def test_each_setting_of_a_check_has_a_default_and_bounds(name):
-    lowest, default, highest = PLAUSIBILITY_SETTINGS[name]
-    assert getattr(PlausibilitySettings(), name) == default
-    for value in (lowest, highest):
-        GuardSettings(plausibility=PlausibilitySettings(**{name: value}))
-    for value in (np.nextafter(lowest, -1.0), np.nextafter(highest, np.inf), np.nan):
-        with pytest.raises(StationError, match=rf"guard settings: plausibility\.{name} is .*; allowed: {lowest:g}"):
-            GuardSettings(plausibility=PlausibilitySettings(**{name: value}))
+#: All settings: prefix in messages, function that creates the settings, name, default and range.
+SETTINGS = [
+    *(("", lambda name, value: GuardSettings(**{name: value}), *row) for row in numbers(GuardSettings)),
+    *(("plausibility.", of_a_check, *row) for row in numbers(PlausibilitySettings)),
+]
 
 
-def test_every_setting_has_bounds():
-    assert set(vars(GuardSettings())) == {*SETTINGS, "resume_automatically", "plausibility"}
-    assert set(vars(PlausibilitySettings())) == {*PLAUSIBILITY_SETTINGS, "bad_samples"}
-    for count, allowed in ((0, True), (100, True), (-1, False), (101, False)):
-        if allowed:
-            GuardSettings(plausibility=PlausibilitySettings(bad_samples=count))
-        else:
-            with pytest.raises(StationError, match=r"plausibility\.bad_samples is .*; allowed: 0\.\.100"):
-                GuardSettings(plausibility=PlausibilitySettings(bad_samples=count))
+@pytest.mark.parametrize(("prefix", "create", "name", "default", "allowed"), SETTINGS, ids=str)
+def test_each_setting_has_bounds(prefix, create, name, default, allowed):
+    for value in (allowed.low, default, allowed.high):
+        create(name, value)
+    step = 1 if isinstance(default, int) else 1e-9
+    text = re.escape(f"guard settings: {prefix}{name} is ") + f".*; allowed: {allowed.low:g}"
+    for value in (allowed.low - step, allowed.high + step, np.nan):
+        with pytest.raises(StationError, match=text):
+            create(name, value)
+
+
+@pytest.mark.parametrize(("prefix", "create", "name", "default", "allowed"), SETTINGS, ids=str)
+def test_settings_weaker_than_defaults_are_named(prefix, create, name, default, allowed):
+    weaker, stronger = allowed.low, allowed.high
+    if name not in WEAKER_IF_SMALLER:
+        weaker, stronger = stronger, weaker
+    assert create(name, default).weaker_than_default() == create(name, stronger).weaker_than_default() == ""
+    text = f"{name} is {weaker:g} (default: {default:g})" if weaker != default else ""
+    assert create(name, weaker).weaker_than_default() == text
 
 
 @pytest.mark.parametrize("value", ["false", 1, None])
 def test_resume_requires_operator_by_default(value):
     assert GuardSettings().resume_automatically is False
+    assert GuardSettings(resume_automatically=True).weaker_than_default().startswith("resume_automatically is true")
     with pytest.raises(StationError, match="guard settings: resume_automatically must be true or false; got"):
         GuardSettings(resume_automatically=value)
-
-
-def test_settings_weaker_than_defaults_are_named():
-    assert GuardSettings().weaker_than_default() == ""
-    assert GuardSettings(margin=0.01).weaker_than_default().startswith("margin is 0.01 (default: ")
-    assert GuardSettings(expiry=0.2).weaker_than_default() == "expiry is 0.2 (default: 0.05)"
-    stronger = {name: low if name not in WEAKER_IF_SMALLER else high for name, (low, _, high) in SETTINGS.items()}
-    checks = {n: low if n not in WEAKER_IF_SMALLER else high for n, (low, _, high) in PLAUSIBILITY_SETTINGS.items()}
-    assert GuardSettings(**stronger, plausibility=PlausibilitySettings(**checks)).weaker_than_default() == ""
-    for name, (low, default, high) in SETTINGS.items():
-        value = low if name in WEAKER_IF_SMALLER else high
-        text = f"{name} is {value:g} (default: {default:g})" if value != default else ""
-        assert GuardSettings(**{name: value}).weaker_than_default() == text
-    for name, (low, default, high) in PLAUSIBILITY_SETTINGS.items():
-        value = low if name in WEAKER_IF_SMALLER else high
-        settings = GuardSettings(resume_automatically=True, plausibility=PlausibilitySettings(**{name: value}))
-        both = f"resume_automatically is true (default: false), {name} is {value:g} (default: {default:g})"
-        assert settings.weaker_than_default() == both
 
 
 def test_late_commands_do_not_act_again_without_an_operator():

@@ -186,34 +186,12 @@ def test_block_ends_acting_commands_until_a_resume(mode):
     bench.started(mode)
 
 
-def test_resume_does_not_end_the_block():
-    bench = Bench().started()
-    bench.guard.block(REASON)
-    bench.tick()
-    bench.send(Command.HOLD)
-    bench.tick()
-    bench.send(Command.HOLD, reset_fault=True)
-    bench.tick()
-    assert bench.guard.hold_reason == ""
-    assert bench.guard.blocked_reason == REASON
-    assert bench.send() == Status.REFUSAL_BAD_MODE
-
-
 def test_block_during_the_start_check_needs_no_resume():
     bench = Bench()
     bench.run(Command.EFFORT, 100)
     assert bench.guard.state == Status.STATE_STARTING
     bench.guard.block(REASON)
     assert bench.guard.state == Status.STATE_HOLD
-    bench.guard.block("")
-    assert bench.guard.blocked_reason == ""
-    bench.started()
-
-
-def test_block_ends_with_automatic_resume():
-    bench = Bench(settings=GuardSettings(resume_automatically=True)).started()
-    bench.guard.block(REASON)
-    bench.tick()
     bench.guard.block("")
     assert bench.guard.blocked_reason == ""
     bench.started()

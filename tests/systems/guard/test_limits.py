@@ -1,10 +1,10 @@
-"""Unit tests of limits: clamping, start of walls and brakes, and passivity."""
+"""Limits that the guard enforces: clamping, start of walls and brakes, passivity, and safe state."""
 
 import dataclasses
 
 import numpy as np
 import pytest
-from guard_bench import ARM, LIMIT, N, Q
+from guard_bench import ARM, LIMIT, Bench, N, Q
 
 from dvrk_drake.dynamics.identified_model import ControlModel, IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
@@ -256,39 +256,45 @@ def test_joints_stop_together_on_coupled_limit(side):
         np.testing.assert_allclose(moved, on, atol=1e-9)
 
 
-def coupled(*limits):
-    """Returns the arm with other coupled limits. Joints differ in effort and in Kd/Kp."""
-    gains = dataclasses.replace(ARM.gains, kd=list(KP * np.linspace(0.05, 0.2, N)))
-    return dataclasses.replace(ARM, coupled_limits=limits, effort_limits=LIMIT * np.linspace(1, 2, N), gains=gains)
-
-
+@pytest.mark.parametrize("row", range(N + 1))
 @pytest.mark.parametrize("side", [-1, 1])
-def test_wall_effort_exceeds_all_pushing_motors(side):
+def test_wall_effort_exceeds_all_pushing_motors(row, side):
     yaw, pitch = ARM.joint_names[0], ARM.joint_names[4]
-    arm = coupled(CoupledLimit("cable", {yaw: -2.0, pitch: 0.5}, -0.5, 0.5))
+    arm = coupled(*[CoupledLimit("cable", {yaw: -2.0, pitch: 0.5}, -0.5, 0.5)] * (row == N))
     limits = GuardLimits(arm, GuardSettings(traverse_time=100.0, margin=0.001))
-    a, effort = arm.limit_matrix()[0][N], arm.effort_limits
+    a, bound, effort = limits.A[row], (limits.lower if side < 0 else limits.upper)[row], arm.effort_limits
     joints = np.flatnonzero(a)
     motor = max(effort[joints] / np.abs(a[joints]))
-    assert limits.wall_width[N] == pytest.approx(max(2 * motor * a**2 / (4 * np.array(arm.gains.kp))))
+    np.testing.assert_allclose(limits.wall_width[row], max(2 * motor * a**2 / (4 * np.array(arm.gains.kp))), atol=1e-12)
     push = side * np.sign(a) * effort
 
     def pushed(depth, rate=0.0):
-        q = Q + (side * (0.5 + (depth - 1) * limits.wall_width[N]) - a @ Q) / (a @ a) * a
+        """Returns effort and flags at a depth in the wall, as a share of its width, with a rate of the coordinate."""
+        q = Q + (bound + side * (depth - 1) * limits.wall_width[row] - a @ Q) / (a @ a) * a
         return limits.restrain_effort(push, q, rate * side * a / (a @ a))
 
     np.testing.assert_allclose(pushed(-0.01)[0], push, atol=1e-12)
     applied, flags = pushed(0.3)
     np.testing.assert_allclose(applied, np.clip(push - 0.6 * side * motor * a, -effort, effort), atol=1e-12)
-    assert flagged(flags) == (list(joints), {Status.FLAG_COUPLED_LIMIT})
-    assert np.all((pushed(0.5)[0] * push)[joints] <= 1e-12)
+    assert flagged(flags) == (
+        list(joints),
+        {Status.FLAG_COUPLED_LIMIT if row == N else Status.FLAG_POSITION_LIMIT},
+    )
+    assert np.all((pushed(0.5)[0] * push)[joints] <= 1e-12)  # no outward effort remains
     np.testing.assert_allclose(pushed(1.0)[0], -push, atol=1e-12)
-    # The wall acts earlier at high speed, by the largest Kd/Kp of these joints.
+    # The wall acts earlier at high speed, by the largest Kd/Kp of these joints, and not on a joint that leaves it.
     seconds = max((np.array(arm.gains.kd) / np.array(arm.gains.kp))[joints])
     rate = 1e-3
     np.testing.assert_allclose(
-        pushed(0.3, rate)[0], pushed(0.3 + seconds * rate / limits.wall_width[N])[0], rtol=1e-9, atol=1e-12
+        pushed(0.3, rate)[0], pushed(0.3 + seconds * rate / limits.wall_width[row])[0], rtol=1e-9, atol=1e-12
     )
+    np.testing.assert_allclose(pushed(0.5, -0.6 * limits.wall_width[row] / seconds)[0], push, atol=1e-12)
+
+
+def coupled(*limits):
+    """Returns the arm with other coupled limits. Joints differ in effort and in Kd/Kp."""
+    gains = dataclasses.replace(ARM.gains, kd=list(KP * np.linspace(0.05, 0.2, N)))
+    return dataclasses.replace(ARM, coupled_limits=limits, effort_limits=LIMIT * np.linspace(1, 2, N), gains=gains)
 
 
 def test_conflicting_coupled_limits_stop_target():
@@ -425,3 +431,55 @@ def test_safe_state_stops_every_joint_with_late_measurements(safe_arm, joint, de
         v = v + 1e-3 * acceleration @ effort
         q = q + 1e-3 * v
     assert 0.5 * (v @ M @ v + (q - q0) @ (gains[0] * (q - q0))) < 0.05 * energy  # the slowest pole is at 0.6 1/s
+
+
+# In the guard
+
+
+def test_efforts_are_clamped_and_limited_in_rate():
+    bench = Bench().started()
+    np.testing.assert_allclose(bench.output.effort, 0.05 * LIMIT, atol=1e-12)
+    for k in range(1, 30):
+        output = bench.run(Command.EFFORT, 1, effort=list(10 * LIMIT))
+        np.testing.assert_allclose(output.effort, np.minimum(0.05 + 0.05 * k, 1.0) * LIMIT, rtol=0, atol=1e-12)
+        assert np.all(output.joint_flags & Status.FLAG_EFFORT_CLAMPED)
+        assert k == 19 or np.all((output.joint_flags & Status.FLAG_RATE_LIMITED != 0) == (k < 19))  # 19: by rounding
+
+
+def test_positions_are_limited_in_rate_and_range():
+    bench = Bench().started(Command.POSITION)
+    bench.follows = True
+    limits = bench.guard.limits
+    A, lower, upper = ARM.limit_matrix()
+    last = bench.output.position
+    np.testing.assert_array_equal(last, Q)
+    for sign in (1, -1):
+        for _ in range(1500):
+            output = bench.run(Command.POSITION, 1, position=list(Q + sign * 100.0))
+            assert np.all(np.abs(output.position - last) <= limits.speed * 1e-3 * (1 + 1e-9))
+            assert np.all((A @ output.position <= upper + 1e-9) & (A @ output.position >= lower - 1e-9))
+            last = output.position
+        free = [0, 3, 4, 5, 6]
+        np.testing.assert_allclose(last[free], (upper if sign > 0 else lower)[:N][free], atol=1e-12)
+        assert last[1] + last[2] == pytest.approx((upper if sign > 0 else lower)[N])
+        assert not np.any(output.velocity)
+
+
+def test_hold_after_position_keeps_near_target():
+    bench = Bench().started(Command.POSITION)
+    bench.q = Q - 0.01  # the arm sags
+    bench.tick()
+    np.testing.assert_array_equal(bench.run(Command.HOLD, 1).position, Q)
+    bench = Bench().started(Command.POSITION)
+    bench.q = Q - 0.2  # the arm is pushed away
+    bench.tick()
+    np.testing.assert_array_equal(bench.run(Command.HOLD, 1).position, Q - 0.2)
+
+
+@pytest.mark.parametrize("name", ["mtmr", "psm"])
+def test_limits_of_other_arms(name):
+    arm = load_arm(name)
+    bench = Bench(arm)
+    bench.started(Command.EFFORT)
+    output = bench.run(Command.EFFORT, 50, effort=list(100 * arm.effort_limits))
+    np.testing.assert_allclose(output.effort, arm.effort_limits, atol=1e-12)

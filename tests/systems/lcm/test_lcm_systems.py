@@ -12,7 +12,6 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.lcm_messages import create_key_file
 from dvrk_drake.systems.driver import DvrkDriver
 from dvrk_drake.systems.guard.command_guard import CommandGuard
-from dvrk_drake.systems.guard.settings import GuardSettings
 from dvrk_drake.systems.guard.states import State
 from dvrk_drake.systems.lcm.arm_link import DrakeLcmArmLink
 from dvrk_drake.systems.lcm.sim_dvrk_driver import DvrkArmServer
@@ -155,19 +154,6 @@ def test_position_commands_move_the_arm():
     assert np.abs(arm.statuses[-1].position_commanded - goal).max() < 1e-9
 
 
-def test_a_fault_is_reset_through_the_sender():
-    lcm = DrakeLcm("memq://")
-    arm = SimulatedArm(lcm)
-    first = CommandSender(lcm)
-    run(lcm, 3, arm, first)
-    arm.guard.report_fault("the amplifier is hot")
-    run(lcm, 100, arm, first)
-    assert arm.statuses[-1].guard_state == Status.STATE_FAULT
-    first.fix("reset_fault", [1.0])
-    run(lcm, 3, arm, first)
-    assert arm.statuses[-1].guard_state == Status.STATE_HOLD
-
-
 def test_arm_falls_in_off_if_driver_accepts_it():
     lcm = DrakeLcm("memq://")
     arm = SimulatedArm(lcm, driver=DvrkDriver(control_modes=["off"]))
@@ -178,30 +164,6 @@ def test_arm_falls_in_off_if_driver_accepts_it():
     assert arm.statuses[-1].guard_state == Status.STATE_OFF
     assert not np.any(arm.statuses[-1].effort_measured)
     assert arm.drift() > 0.01
-
-
-def test_efforts_after_off_are_refused_while_braking():
-    lcm = DrakeLcm("memq://")
-    driver = DvrkDriver(control_modes=["effort", "off"], guard=GuardSettings(start_time=0.05))
-    arm = SimulatedArm(lcm, driver=driver)
-    sender = CommandSender(lcm)
-    for mode, milliseconds in ((Command.HOLD, 50), (Command.OFF, 50), (Command.HOLD, 5)):
-        sender.fix("control_mode", [float(mode)])
-        run(lcm, milliseconds, arm, sender)
-    model = ControlModel(IdentifiedModel.from_arm(arm.arm))
-    sender.fix("control_mode", [float(Command.EFFORT)])
-    shares = []
-    while (status := arm.statuses[-1]).guard_state != Status.STATE_EFFORT and len(arm.statuses) < 1000:
-        gravity = model.gravity_effort(np.array(status.position))
-        sender.fix("effort_commanded", gravity)
-        shares.append(np.max(np.abs(status.effort_measured - gravity) / arm.arm.effort_limits))
-        run(lcm, 1, arm, sender)
-    assert (status.guard_state, status.refusal_code) == (Status.STATE_EFFORT, Status.REFUSAL_START_FAR)
-    # A command is checked in the period after the status that it answers.
-    refused = np.diff([status.num_refused for status in arm.statuses[-len(shares) :]]) > 0
-    shares = np.array(shares[:-1])
-    assert refused.sum() > 10
-    assert shares[refused].min() > 0.09 and shares[~refused].max() < 0.11
 
 
 def test_sender_commands_hold_without_finite_numbers():

@@ -149,16 +149,6 @@ def test_servo_cp_moves_the_last_frame(name):
     assert "servo_cp refused: the arm cannot reach the pose from the present set-point" in simulated.lines
 
 
-def test_gravity_compensation_with_friction_keeps_the_pose():
-    simulated = Simulated("mtml", ["friction"], gravity_compensation=True)
-    simulated.home()
-    simulated.wait(1.0)
-    simulated.send("free", seconds=0.2)
-    before = simulated.q
-    simulated.wait(1.0)
-    np.testing.assert_allclose(simulated.q, before, rtol=0, atol=0.02)
-
-
 def test_driver_file(tmp_path):
     path = tmp_path / "driver.yaml"
     path.write_text("domain: 3\nnamespace: dvrk/MTML\nrate: 500\ngravity_compensation: true\n")
