@@ -221,7 +221,9 @@ def calibrate(
             raise KeyboardInterrupt
         failure = f"{step.title} failed; the line above states the reason"
         if code and step.is_required:
-            raise CollectionError(f"{failure}. The same command continues the calibration")
+            # A validation that fails has written its report, so the step is complete.
+            accepts = "accepts this result and continues. To improve it, use a new folder and more --poses"
+            raise CollectionError(f"{failure}. The same command {accepts if step.done() else 'repeats this step'}")
         if code:
             report(f"{failure}. The calibration continues")
     static, model = (IdentifiedModel.load(folder / file) for file in (STATIC, DYNAMIC))

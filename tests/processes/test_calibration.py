@@ -187,7 +187,22 @@ def test_without_terminal_an_arm_moves_only_with_yes(tmp_path, ran, capsys):
 def test_failed_step_ends_the_calibration(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(calibration, "_run", lambda words, folder: 2)
     line = refused(capsys, *command(tmp_path / "c"))
-    assert "Choose static poses failed" in line
+    assert "Choose static poses failed" in line and "The same command repeats this step" in line
+
+
+def test_only_a_second_command_accepts_a_model_that_failed(tmp_path, monkeypatch, capsys):
+    """The arm would follow motions with it, so the line says what the same command does."""
+
+    def run(words, folder):
+        return substitute(words, folder) or 2 * ("validate" in words and "usable" in words)
+
+    monkeypatch.setattr(calibration, "_run", run)
+    line = refused(capsys, *command(tmp_path / "c"))
+    assert "The same command accepts this result and continues" in line
+    assert not (tmp_path / "c" / "motion.yaml").exists()
+    assert "accepts this result" in refused(capsys, *command(tmp_path / "c"))  # the full dynamics failed
+    assert (tmp_path / "c" / "test_motion.csv").exists() and not (tmp_path / "c" / "gravity.json").exists()
+    assert main(command(tmp_path / "c")) == 0
 
 
 @pytest.mark.parametrize(
