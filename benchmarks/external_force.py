@@ -41,14 +41,12 @@ from dvrk_drake.analysis.excitation.motion_limits import MotionLimits
 from dvrk_drake.analysis.excitation.periodic_motion import PeriodicMotion
 from dvrk_drake.analysis.excitation.random_motion import random_motion
 from dvrk_drake.analysis.identification import identify
-from dvrk_drake.dynamics.contact import Contact
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.dynamics.kinematics import ArmFrame
+from dvrk_drake.dynamics.kinematics import ArmFrame, Contact
 from dvrk_drake.dynamics.momentum_observer import BANDWIDTH, MomentumObserver
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.models.effect_kinds import POSITION_KINDS
-from dvrk_drake.models.effects_schema import half_width
+from dvrk_drake.models.effects_schema import POSITION_KINDS, half_width
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.closed_loop import add_closed_loop

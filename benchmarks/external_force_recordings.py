@@ -22,8 +22,7 @@ from timing import print_table
 from dvrk_drake.analysis.external_force import estimate_force
 from dvrk_drake.analysis.identification import identify
 from dvrk_drake.analysis.observations.observations import Observations
-from dvrk_drake.dynamics.contact import Contact
-from dvrk_drake.dynamics.kinematics import ArmFrame
+from dvrk_drake.dynamics.kinematics import ArmFrame, Contact
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.reading import read_recording
 

@@ -48,7 +48,7 @@ from timing import measured_times, median_ratio, print_table, write_json
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.models.linear_map import LinearMap
+from dvrk_drake.models.arm_schema import LinearMap
 from dvrk_drake.models.plant import add_arm, set_arm_positions
 from dvrk_drake.models.sdf_elements import DRAKE
 from dvrk_drake.models.sdf_model import compose_sdf

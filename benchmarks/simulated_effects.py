@@ -32,7 +32,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import EFFECT_NAMES, ArmEffects
-from dvrk_drake.models.loop_closure import Closure
+from dvrk_drake.models.plant import Closure
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController

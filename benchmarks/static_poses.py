@@ -23,10 +23,10 @@ from timing import print_table
 
 import dvrk_drake as dvrk
 from dvrk_drake.analysis.estimation.pose_effects import MIN_TORQUE
+from dvrk_drake.analysis.excitation.pose_file import approach_offset, offset_pose
 from dvrk_drake.analysis.pose_identification import identify_static
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, joint_row, position_along
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
-from dvrk_drake.models.approach import approach_offset, offset_pose
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.processes.collector import CollectionSettings, estimated_duration

@@ -27,7 +27,7 @@ from rich.table import Table
 from timing import write_json
 
 import dvrk_drake as dvrk
-from dvrk_drake.analysis.observations.low_pass import low_pass
+from dvrk_drake.analysis.observations.signals import low_pass
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 
 RATE, CUT_OFF, ENDS = 200.0, 17.0, 100

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from dvrk_drake.analysis.payload import payload
     from dvrk_drake.analysis.recalibration import recalibrate
     from dvrk_drake.analysis.validation import predict, validate
-    from dvrk_drake.dynamics.contact import Contact
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
+    from dvrk_drake.dynamics.kinematics import Contact
     from dvrk_drake.errors import DvrkDrakeError
     from dvrk_drake.experiments.ground_truth import perturbed_arm, simulate_poses
     from dvrk_drake.experiments.scenario import Scenario, load_scenario
@@ -39,8 +39,7 @@ if TYPE_CHECKING:
     from dvrk_drake.processes.connection import ArmConnection, connect
     from dvrk_drake.recordings.reading import read_recording
     from dvrk_drake.recordings.recording import Recording
-    from dvrk_drake.recordings.samples import write_samples
-    from dvrk_drake.recordings.writing import write_recording
+    from dvrk_drake.recordings.writing import write_recording, write_samples
     from dvrk_drake.reports.write import write_report
     from dvrk_drake.systems.arm_drive import add_arm_drive
     from dvrk_drake.systems.arm_effects.dry_friction import PlantEffects
@@ -62,7 +61,7 @@ _MODULES = {
     "ArmConnection": "processes.connection",
     "ArmStation": "systems.arm_station",
     "CollectionSettings": "processes.collector",
-    "Contact": "dynamics.contact",
+    "Contact": "dynamics.kinematics",
     "CrtkDriver": "systems.driver",
     "Dialog": "processes.arm_session",
     "DvrkDrakeError": "errors",
@@ -109,7 +108,7 @@ _MODULES = {
     "validate": "analysis.validation",
     "write_recording": "recordings.writing",
     "write_report": "reports.write",
-    "write_samples": "recordings.samples",
+    "write_samples": "recordings.writing",
 }
 
 __all__ = [

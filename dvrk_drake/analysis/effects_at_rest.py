@@ -11,12 +11,11 @@ from dvrk_drake.analysis.estimation.estimator import Estimator, Prior
 from dvrk_drake.analysis.estimation.normal_equations import NormalEquations, fold_sums
 from dvrk_drake.analysis.estimation.robust_fit import FOLDS, blocks
 from dvrk_drake.analysis.pose_identification import MIN_MOTION, StaticIdentification
-from dvrk_drake.analysis.verdict import NEGLIGIBLE
+from dvrk_drake.analysis.results import NEGLIGIBLE
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, distinct_coordinates, position_along, spring_over
 from dvrk_drake.dynamics.dynamic_model import ROUNDING_EFFORT
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.models.effect_kinds import EFFECT_KINDS
-from dvrk_drake.models.effects_schema import DriveEffect
+from dvrk_drake.models.effects_schema import EFFECT_KINDS, DriveEffect
 
 #: Smallest coefficient of a correction in standard errors. With half the value, `mtmr_2017_sweep40` gives the same
 #: corrections of the model of `mtm_one`; with twice the value, one of four is omitted.

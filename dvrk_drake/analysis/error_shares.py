@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.estimation.motion_columns import DIRECTION_WIDTH
-from dvrk_drake.analysis.observations.noise import MOTION_FREQUENCY
+from dvrk_drake.analysis.observations.signals import MOTION_FREQUENCY
 from dvrk_drake.recordings.recording import GAP, MIN_GAP
 
 #: Number of frequencies of the sine and cosine functions in the position-dependent error: those of the cable effects in

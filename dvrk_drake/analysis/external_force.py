@@ -12,9 +12,9 @@ from dvrk_drake.analysis.check.recording_check import require_usable, with_power
 from dvrk_drake.analysis.motion_validation import validate_motion
 from dvrk_drake.analysis.observations.finding import Finding
 from dvrk_drake.analysis.observations.observations import Observations
-from dvrk_drake.dynamics.contact import Axes, Contact, is_measurable
-from dvrk_drake.dynamics.dry_friction_bound import DryFrictionBound
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.kinematics import Axes, Contact, is_measurable
+from dvrk_drake.dynamics.momentum_observer import DryFrictionBound
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.effects_schema import half_width
 from dvrk_drake.models.files import Reportable, refuse_existing
@@ -85,7 +85,7 @@ class ExternalForce(Reportable):
         Raises:
             DvrkDrakeError: The file exists and `overwrite` is False, or the file cannot be written.
         """
-        from dvrk_drake.recordings.writer_csv import write_csv
+        from dvrk_drake.recordings.csv_files import write_csv
 
         refuse_existing(path, overwrite)
         measured = [np.where(self.measurable, x, np.nan) for x in (self.force, self.half_width)]

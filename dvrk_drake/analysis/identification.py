@@ -21,7 +21,7 @@ from dvrk_drake.analysis.observations.finding import Finding
 from dvrk_drake.analysis.observations.observations import Observations, Poses
 from dvrk_drake.analysis.observations.static_poses import find_excluded, usable_measurements, usable_poses
 from dvrk_drake.analysis.pose_identification import Method, StaticIdentification, identify_static
-from dvrk_drake.analysis.verdict import unexplained_effort
+from dvrk_drake.analysis.results import unexplained_effort
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, effect_column
 from dvrk_drake.dynamics.base_parameters import independent_columns
 from dvrk_drake.dynamics.dynamic_model import ROUNDING_EFFORT

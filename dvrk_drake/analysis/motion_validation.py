@@ -13,8 +13,7 @@ from dvrk_drake.analysis.observations.finding import Finding
 from dvrk_drake.analysis.observations.motion_grid import MotionGrid
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.observations.repetition import motion_floor
-from dvrk_drake.analysis.results import JudgedError, Validation
-from dvrk_drake.analysis.verdict import coverage, judge, rule_text, tolerances
+from dvrk_drake.analysis.results import JudgedError, Validation, coverage, judge, rule_text, tolerances
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 
 #: Smallest ratio of an error to the one expected on another day that is reported. It is exceeded in 12 of 12 pairs of

@@ -19,8 +19,7 @@ from dvrk_drake.analysis.observations.static_poses import (
     usable_measurements,
     usable_poses,
 )
-from dvrk_drake.analysis.results import Identification
-from dvrk_drake.analysis.verdict import LARGEST_RATIO
+from dvrk_drake.analysis.results import LARGEST_RATIO, Identification
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.holding_torque import static_model
 from dvrk_drake.dynamics.identified_model import (

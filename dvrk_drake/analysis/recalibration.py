@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.check.recording_check import require_usable, with_power
-from dvrk_drake.analysis.estimation.estimator import Estimator, Prior
+from dvrk_drake.analysis.estimation.estimator import EFFECT_DEVIATION, Estimator, Prior
 from dvrk_drake.analysis.estimation.motion_estimates import MAX_CORRELATION_TIME
 from dvrk_drake.analysis.estimation.normal_equations import NormalEquations, fold_sums
-from dvrk_drake.analysis.estimation.priors import EFFECT_DEVIATION
 from dvrk_drake.analysis.observations.motion_difference import (
     FrictionPart,
     drive_efforts,
@@ -25,8 +24,7 @@ from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_section import ActuatorStatistics, DynamicSection
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import RecordingError
-from dvrk_drake.models.effect_kinds import EFFECT_KINDS
-from dvrk_drake.models.effects_schema import DriveEffect
+from dvrk_drake.models.effects_schema import EFFECT_KINDS, DriveEffect
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.recording import REST_SPEED, Recording
 

@@ -26,8 +26,18 @@ from dvrk_drake.analysis.observations.static_poses import (
     find_excluded,
     usable_measurements,
 )
-from dvrk_drake.analysis.results import Identification, JudgedError, Prediction, Validation
-from dvrk_drake.analysis.verdict import NEGLIGIBLE, coverage, judge, rule_text, tolerances, unexplained_effort
+from dvrk_drake.analysis.results import (
+    NEGLIGIBLE,
+    Identification,
+    JudgedError,
+    Prediction,
+    Validation,
+    coverage,
+    judge,
+    rule_text,
+    tolerances,
+    unexplained_effort,
+)
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ModelError, RecordingError
 from dvrk_drake.progress import Progress, step_progress

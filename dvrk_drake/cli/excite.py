@@ -71,7 +71,7 @@ def excite(
     import numpy as np
 
     from dvrk_drake.analysis.excitation.static_poses import MARGIN
-    from dvrk_drake.recordings.writer_csv import write_csv
+    from dvrk_drake.recordings.csv_files import write_csv
     from dvrk_drake.reports.excitation import motion_page, poses_page
 
     design_options = {"duration": duration, "period": period, "harmonics": harmonics, "starts": starts}

@@ -213,7 +213,7 @@ def predict(
             of the 95 % prediction interval. The columns lower_other_day1..n and upper_other_day1..n are those on
             another day than that of the model's recording.
     """
-    from dvrk_drake.recordings.writer_csv import write_csv
+    from dvrk_drake.recordings.csv_files import write_csv
     from dvrk_drake.reports.terminal import make_console
 
     support.check_output(output, recording, model, overwrite=overwrite)

@@ -132,7 +132,7 @@ def gravity_vector(_: object, tokens: Sequence[Token]) -> tuple[float, float, fl
     except ValueError:
         raise ValueError(f"{min(keywords)}: {' '.join(words)!r} are not numbers") from None
     if is_mount:
-        from dvrk_drake.models.mounting import mount_gravity
+        from dvrk_drake.models.arm import mount_gravity
 
         if len(numbers) not in (1, 3) or not all(abs(x) <= 2 * math.pi for x in numbers):
             raise ValueError("--mount needs roll, pitch and yaw, or mounting_pitch, up to 6.28 rad, a file, or a topic")

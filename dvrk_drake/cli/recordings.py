@@ -24,7 +24,7 @@ def samples(folder: str, /, *, overwrite: options.Overwrite = False) -> None:
     Args:
         folder: Folder to write to, which must be new or empty.
     """
-    from dvrk_drake.recordings.samples import SAMPLES
+    from dvrk_drake.recordings.writing import SAMPLES
 
     target = support.new_folder(folder, overwrite=overwrite)
     with support.Steps("writing") as steps:

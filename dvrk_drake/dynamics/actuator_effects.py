@@ -17,8 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from dvrk_drake.dynamics.compiled import compiled
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.effect_kinds import EFFECT_KINDS, kind_fault
-from dvrk_drake.models.effects_schema import DriveEffect
+from dvrk_drake.models.effects_schema import EFFECT_KINDS, DriveEffect, kind_fault
 
 
 @compiled

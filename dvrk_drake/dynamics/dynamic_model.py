@@ -14,8 +14,7 @@ from dvrk_drake.dynamics.dynamic_section import DynamicSection
 from dvrk_drake.dynamics.inertial_parameters import PARAMETER_NAMES, LinkInertia, pseudo_inertia
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.effect_kinds import EFFECT_KINDS, POSITION_KINDS
-from dvrk_drake.models.effects_schema import half_width
+from dvrk_drake.models.effects_schema import EFFECT_KINDS, POSITION_KINDS, half_width
 from dvrk_drake.models.ranges import number_fault
 
 

@@ -15,8 +15,7 @@ from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, effect_fault, i
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ControllerError, ModelError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.effect_kinds import EFFECT_KINDS
-from dvrk_drake.models.effects_schema import half_width
+from dvrk_drake.models.effects_schema import EFFECT_KINDS, half_width
 
 #: Largest travel before sliding [rad], [m] of the presliding effects that are assumed to hold the arm at rest. It is
 #: the largest drift after a release that is accepted (figures 5, 6 and 8 in docs/benchmark_tables.md).

@@ -21,7 +21,7 @@ from dvrk_drake.dynamics.compiled import compiled, compiled_for, read_only, sin_
 from dvrk_drake.dynamics.gravity_parameters import GravityParameters, gravity_parameters
 from dvrk_drake.dynamics.kinematic_tree import KinematicTree
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.effect_kinds import EFFECT_KINDS
+from dvrk_drake.models.effects_schema import EFFECT_KINDS
 
 #: Link with its joint frame Z, see `KinematicTree`. R and p are the pose of Z at x = 0 in the joint frame of the
 #: parent, whose index is `parent`. m and h are the mass and the first moment about the origin of Z. The last six fields

@@ -31,8 +31,7 @@ from dvrk_drake.errors import ArmError, ModelError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import known_arms, load_arm
 from dvrk_drake.models.arm_schema import GRAVITIES
-from dvrk_drake.models.effect_kinds import POSITION_KINDS
-from dvrk_drake.models.effects_schema import FREEDOMS, DriveEffect, half_width
+from dvrk_drake.models.effects_schema import FREEDOMS, POSITION_KINDS, DriveEffect, half_width
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.models.locked_joints import lock_joints
 from dvrk_drake.models.model_file import MODEL_SUFFIXES

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dvrk_drake.analysis.excitation.pose_file import offset_pose
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.experiments.scenario import ControllerScenario
 from dvrk_drake.experiments.simulation import scenario_of_arm, simulate
-from dvrk_drake.models.approach import offset_pose
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.systems.gravity_pid_controller import Mode
 from dvrk_drake.workers import await_results

@@ -20,7 +20,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ScenarioError, SimulationError
 from dvrk_drake.experiments.scenario import Scenario, Target
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.loop_closure import Closure
+from dvrk_drake.models.plant import Closure
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.recording import Recording, Setpoints
 from dvrk_drake.systems.arm_station import ArmStation, arm_plant_config

@@ -25,8 +25,7 @@ from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import (
 )
 from dvrk_drake.export.gravity_compensation_loss import CompensationLoss, accepted_differences, make_loss
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.effect_kinds import EFFECT_KINDS
-from dvrk_drake.models.effects_schema import DriveEffect
+from dvrk_drake.models.effects_schema import EFFECT_KINDS, DriveEffect
 
 #: Number of random poses at which the torques of file and model are compared.
 POSES = 20000

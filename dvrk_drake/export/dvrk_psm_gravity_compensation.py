@@ -32,9 +32,8 @@ from dvrk_drake.dynamics.inertial_parameters import LinkInertia
 from dvrk_drake.dynamics.model_links import model_bodies
 from dvrk_drake.errors import ModelError
 from dvrk_drake.export.gravity_compensation_loss import CompensationLoss, accepted_differences, make_loss
-from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm import Arm, mount_gravity
 from dvrk_drake.models.files import atomic_write, read_json_input
-from dvrk_drake.models.mounting import mount_gravity
 from dvrk_drake.models.plant import shared_plant
 
 ARM_JOINTS = ("yaw", "pitch", "insertion")

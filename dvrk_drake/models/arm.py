@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import PurePath
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,14 +27,12 @@ from dvrk_drake.models.arm_schema import (
     Frames,
     Gains,
     IdentificationSettings,
+    LinearMap,
     LoopClosure,
     ViewSettings,
 )
-from dvrk_drake.models.effect_kinds import EFFECT_KINDS
-from dvrk_drake.models.effects_schema import ArmEffects, per_actuator
+from dvrk_drake.models.effects_schema import EFFECT_KINDS, ArmEffects, per_actuator
 from dvrk_drake.models.immutable import cached, immutable
-from dvrk_drake.models.linear_map import LinearMap
-from dvrk_drake.models.mounting import mount_gravity
 from dvrk_drake.models.ranges import RANGE, Range, number_fault
 
 #: Maximum norm of the gravity vector [m/s^2].
@@ -416,3 +416,63 @@ def checked_gravity(gravity: ArrayLike) -> NDArray[np.float64]:
         numbers = ", ".join(f"{x:g}" for x in vector.ravel())
         raise ArmError(f"gravity ({numbers}) must be a vector of three numbers with a norm up to {MAX_GRAVITY:g} m/s^2")
     return vector
+
+
+#: Acceleration of gravity [m/s^2], as in the controller of the dVRK.
+GRAVITY = 9.81
+
+
+def mount_gravity(roll: float, pitch: float = 0.0, yaw: float = 0.0) -> tuple[float, float, float]:
+    """Returns the gravity vector (3,) in the frame of a base with an orientation in the world [m/s^2].
+
+    Args:
+        roll: Angle about the x axis [rad]. `mounting_pitch` in the configuration of an arm of the dVRK is this angle.
+        pitch: Angle about the y axis [rad].
+        yaw: Angle about the z axis of the world [rad], which has no effect.
+    """
+    # The negative third row of the rotation matrix Rz(yaw) Ry(pitch) Rx(roll).
+    horizontal = math.cos(pitch)
+    return (
+        GRAVITY * math.sin(pitch),
+        -GRAVITY * horizontal * math.sin(roll),
+        -GRAVITY * horizontal * math.cos(roll),
+    )
+
+
+#: Largest gain of a soft wall, divided by the gain of the position controller. Larger gains cause chatter at a period
+#: of 1 ms.
+_WALL_GAIN = 4.0
+
+
+class SoftWalls(NamedTuple):
+    """Soft walls before the position limits lower <= A q <= upper, see `Arm.limit_matrix`.
+
+    Attributes:
+        effort: Effort (k,) along A q that cancels the full motor effort of each joint of the limit.
+        look_ahead: Times T (k,) [s]. A wall acts on A q + T A v.
+        width: Smallest widths (k,) of the walls in the unit of A q, limited by the gain of the wall.
+    """
+
+    effort: NDArray[np.float64]
+    look_ahead: NDArray[np.float64]
+    width: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, arm: Arm) -> SoftWalls:
+        """Returns the walls of an arm."""
+        A, _, _ = arm.limit_matrix()
+        kp, kd = np.array(arm.gains.kp), np.array(arm.gains.kd)
+        look_ahead = np.array([max((kd / kp)[row != 0]) for row in A])
+        return cls(_wall_effort(arm), look_ahead, (wall_stiffness(arm) / kp).max(axis=1))
+
+
+def wall_stiffness(arm: Arm) -> NDArray[np.float64]:
+    """Returns the widths of the walls (k, n) times the gain kp of each joint, which do not depend on the gains."""
+    A, _, _ = arm.limit_matrix()
+    return 2 * _wall_effort(arm)[:, None] * A**2 / _WALL_GAIN
+
+
+def _wall_effort(arm: Arm) -> NDArray[np.float64]:
+    A, _, _ = arm.limit_matrix()
+    limits = np.array(arm.effort_limits)
+    return np.array([max(limits[row != 0] / np.abs(row[row != 0])) for row in A])

@@ -22,13 +22,13 @@ from dvrk_drake.models.arm_schema import (
     Gains,
     IdentificationSettings,
     Instrument,
+    LinearMap,
     Mechanism,
     ViewSettings,
 )
 from dvrk_drake.models.dvrk_tool import dvrk_tools, tool_instrument
 from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.models.immutable import cached
-from dvrk_drake.models.linear_map import LinearMap
 from dvrk_drake.models.model_file import MODEL_SUFFIXES
 from dvrk_drake.models.ranges import suggest_name
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL, SdfFacts, compose_sdf, local_path, read_sdf_facts

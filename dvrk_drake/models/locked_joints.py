@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from dvrk_drake.errors import ArmError, RecordingError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.arm_schema import CoupledLimit, Gains
+from dvrk_drake.models.arm_schema import CoupledLimit, Gains, LinearMap
 from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.models.immutable import cached
-from dvrk_drake.models.linear_map import LinearMap
 from dvrk_drake.models.ranges import suggest_name
 
 #: Largest distance of a locked joint from its stated position in a recording [rad, m].

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, System
 
+from dvrk_drake.analysis.excitation.pose_file import approach_offset
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
-from dvrk_drake.models.approach import approach_offset
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_schema import Gains
 from dvrk_drake.systems.closed_loop import EffortRamp, add_closed_loop

@@ -11,11 +11,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.excitation.pose_file import CollectionFile, load_poses, pose_environment
+from dvrk_drake.analysis.excitation.pose_file import CollectionFile, load_poses, offset_pose, pose_environment
 from dvrk_drake.dynamics.identified_model import ControlModel
 from dvrk_drake.errors import CollectionError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
-from dvrk_drake.models.approach import offset_pose
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.ranges import number_fault, within
 from dvrk_drake.processes.arm_controller import ArmController, GoalController, MotionStyle

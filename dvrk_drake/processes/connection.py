@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from dvrk_drake.analysis.verdict import cross_validated_verdicts, unfit
+from dvrk_drake.analysis.results import cross_validated_verdicts, unfit
 from dvrk_drake.dynamics.friction_compensation import Friction, holding_error, is_cross_validated
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ControllerError

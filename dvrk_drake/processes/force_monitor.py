@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from dvrk_drake.dynamics.contact import Contact, is_measurable
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.kinematics import Contact, is_measurable
 from dvrk_drake.dynamics.momentum_observer import BANDWIDTH, MomentumObserver
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.lcmtypes import lcmt_dvrk_force, lcmt_dvrk_status

@@ -16,11 +16,10 @@ from dvrk_drake.analysis.excitation.periodic_motion import PeriodicMotion
 from dvrk_drake.errors import CollectionError, RecordingError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.files import atomic_write, open_input
+from dvrk_drake.models.files import GrowingFile, atomic_write, csv_line, open_input
 from dvrk_drake.models.ranges import within
 from dvrk_drake.models.typed_yaml import load_typed_yaml
-from dvrk_drake.recordings.csv_rows import parse_finite
-from dvrk_drake.recordings.growing_file import GrowingFile, csv_line
+from dvrk_drake.recordings.csv_files import parse_finite
 from dvrk_drake.recordings.reader_lcm import measurements
 from dvrk_drake.recordings.writer_stream import status_cells, status_columns
 

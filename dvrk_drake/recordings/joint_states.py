@@ -17,9 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.locked_joints import check_held, lock_hint
-from dvrk_drake.recordings.reader_options import FileOptions
+from dvrk_drake.recordings.reader_options import MEASURED_JS, FileOptions
 from dvrk_drake.recordings.recording import Recording
-from dvrk_drake.recordings.topic_choice import MEASURED_JS
 
 #: Longest distance in time between a message of the arm and the messages of its jaw [s].
 MAX_JAW_GAP = 0.05

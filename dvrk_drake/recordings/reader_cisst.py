@@ -17,7 +17,7 @@ import numpy as np
 
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.files import open_input, read_input
-from dvrk_drake.recordings.csv_rows import CsvFile, read_numbers
+from dvrk_drake.recordings.csv_files import CsvFile, read_numbers
 from dvrk_drake.recordings.joint_states import JointStates, joint_recording, order_in_time
 from dvrk_drake.recordings.reader_options import FileOptions, sha256_of
 from dvrk_drake.recordings.recording import Coordinates, Recording

@@ -15,7 +15,8 @@ from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import is_package_arm
 from dvrk_drake.models.locked_joints import lock_hint
-from dvrk_drake.recordings.csv_rows import (
+from dvrk_drake.recordings.csv_files import (
+    UNITS,
     CsvFile,
     is_comment,
     is_number,
@@ -24,10 +25,8 @@ from dvrk_drake.recordings.csv_rows import (
     read_numbers,
 )
 from dvrk_drake.recordings.joint_states import MESSAGE_BLOCKS, JointState, collect_joint_states, joint_recording
-from dvrk_drake.recordings.reader_options import FileOptions, instrument_notes, sha256_of
+from dvrk_drake.recordings.reader_options import FileOptions, check_namespace, instrument_notes, sha256_of
 from dvrk_drake.recordings.recording import FileCoordinates, Recording
-from dvrk_drake.recordings.topic_choice import check_namespace
-from dvrk_drake.recordings.writer_csv import UNITS
 
 #: Columns with the same text in each row. `write_recording` and `collect` write them.
 _STATEMENTS = ("coordinates", "arm")

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.files import read_input
-from dvrk_drake.recordings.csv_rows import listed
+from dvrk_drake.recordings.csv_files import listed
 from dvrk_drake.recordings.reader_options import FileOptions, sha256_of
 from dvrk_drake.recordings.recording import Recording
 

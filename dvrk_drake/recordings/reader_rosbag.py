@@ -24,9 +24,8 @@ from dvrk_drake.recordings.joint_states import (
     collect_joint_states,
     joint_recording,
 )
-from dvrk_drake.recordings.reader_options import FileOptions, instrument_notes, sha256_of
+from dvrk_drake.recordings.reader_options import FileOptions, choose_topic, instrument_notes, sha256_of
 from dvrk_drake.recordings.recording import Recording
-from dvrk_drake.recordings.topic_choice import choose_topic
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection

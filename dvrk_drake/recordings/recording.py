@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.arm_schema import IMPLAUSIBLE
-from dvrk_drake.models.linear_map import LinearMap
+from dvrk_drake.models.arm_schema import IMPLAUSIBLE, LinearMap
 
 #: Coordinates of q, qd and tau.
 Coordinates = Literal["joint", "actuator"]

@@ -17,12 +17,11 @@ import numpy as np
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.files import atomic_write
+from dvrk_drake.models.files import GrowingFile, atomic_write, csv_line
 from dvrk_drake.models.lcm_messages import status_channel
-from dvrk_drake.recordings.growing_file import GrowingFile, csv_line
+from dvrk_drake.recordings.csv_files import column_names
 from dvrk_drake.recordings.joint_states import MAX_LATE
 from dvrk_drake.recordings.reader_lcm import LcmEvent, StatusStream, event_bytes, measurements
-from dvrk_drake.recordings.writer_csv import column_names
 from dvrk_drake.recordings.writer_mcap import ArmMessages, GrowingMcap
 
 #: Ending of the file name of an LCM log.

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.motion_identification import DynamicIdentification
 from dvrk_drake.analysis.motion_validation import DynamicValidation
-from dvrk_drake.analysis.results import Identification, Validation
+from dvrk_drake.analysis.results import Identification, Validation, cross_validated_verdicts, worst
 from dvrk_drake.analysis.validation import StaticValidation
-from dvrk_drake.analysis.verdict import cross_validated_verdicts, worst
 from dvrk_drake.dynamics.identified_model import Verdict
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.locked_joints import locked_option

@@ -16,8 +16,7 @@ from dvrk_drake.dynamics.actuator_effects import (
 )
 from dvrk_drake.dynamics.dynamic_model import effect_shapes
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.effect_kinds import POSITION_KINDS
-from dvrk_drake.models.effects_schema import DriveEffect
+from dvrk_drake.models.effects_schema import POSITION_KINDS, DriveEffect
 from dvrk_drake.reports.colours import FITTED, MEASURED
 from dvrk_drake.reports.efforts import Efforts
 from dvrk_drake.reports.page import Plot

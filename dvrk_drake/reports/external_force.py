@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.external_force import ExternalForce
-from dvrk_drake.dynamics.contact import is_measurable
+from dvrk_drake.dynamics.kinematics import is_measurable
 from dvrk_drake.models.effects_schema import half_width
 from dvrk_drake.reports.colours import FITTED, HELD_OUT, NEUTRAL
 from dvrk_drake.reports.page import Block, Page, Plot, Scene, Section, Table, Text, warning_texts

@@ -14,9 +14,15 @@ from dvrk_drake.analysis.motion_identification import DynamicIdentification
 from dvrk_drake.analysis.motion_validation import DynamicValidation
 from dvrk_drake.analysis.pose_identification import StaticIdentification
 from dvrk_drake.analysis.recalibration import FOLDS, Recalibration
-from dvrk_drake.analysis.results import Identification, Validation
+from dvrk_drake.analysis.results import (
+    MIN_COVERAGE,
+    Identification,
+    Validation,
+    cross_validated_verdicts,
+    identified_coverage,
+    rule_text,
+)
 from dvrk_drake.analysis.validation import StaticValidation
-from dvrk_drake.analysis.verdict import MIN_COVERAGE, cross_validated_verdicts, identified_coverage, rule_text
 from dvrk_drake.dynamics.identified_model import Verdict as VerdictWord
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.reports.answers import answer_of, percent

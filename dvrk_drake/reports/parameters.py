@@ -13,8 +13,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.model_links import nearest_links
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.effect_kinds import EFFECT_KINDS
-from dvrk_drake.models.effects_schema import DriveEffect, half_width
+from dvrk_drake.models.effects_schema import EFFECT_KINDS, DriveEffect, half_width
 from dvrk_drake.reports.page import Block, Cell, Table, Text
 
 #: Largest absolute value that is considered a rounding error [kg, kg m, kg m^2].

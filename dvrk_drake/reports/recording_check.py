@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.check.report import RecordingReport
-from dvrk_drake.analysis.observations.noise import spectra
+from dvrk_drake.analysis.observations.signals import spectra
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.reports.colours import LIMIT, MEASURED, REFERENCE

@@ -16,8 +16,7 @@ from pydrake.systems.primitives import MatrixGain
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import ArmEffects
-from dvrk_drake.models.loop_closure import Closure
-from dvrk_drake.models.plant import add_arm
+from dvrk_drake.models.plant import Closure, add_arm
 from dvrk_drake.systems.arm_drive import ArmDrive, add_arm_drive
 from dvrk_drake.systems.arm_effects.dry_friction import PlantEffects
 from dvrk_drake.systems.ideal_drive import plant_config_fault

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem, ValueProducer
 
-from dvrk_drake.dynamics.contact import Contact, is_measurable
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.kinematics import Contact, is_measurable
 from dvrk_drake.dynamics.momentum_observer import BANDWIDTH, MomentumObserver
 from dvrk_drake.errors import ArmError, ControllerError
 from dvrk_drake.models.arm_schema import IMPLAUSIBLE

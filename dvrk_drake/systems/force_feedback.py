@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from pydrake.math import RotationMatrix
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from dvrk_drake.dynamics.contact import Contact
+from dvrk_drake.dynamics.kinematics import Contact
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_schema import IMPLAUSIBLE

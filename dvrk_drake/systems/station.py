@@ -18,9 +18,8 @@ from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.environment import add_directives
 from dvrk_drake.models.files import read_text_input
-from dvrk_drake.models.loop_closure import Closure
 from dvrk_drake.models.model_file import add_packages
-from dvrk_drake.models.plant import add_arm, package_map
+from dvrk_drake.models.plant import Closure, add_arm, package_map
 from dvrk_drake.systems.arm_drive import GRAVITY_TOLERANCE, ArmDrive, add_arm_drive, gravity_at_base
 from dvrk_drake.systems.arm_effects.dry_friction import PlantEffects
 from dvrk_drake.systems.arm_station import export_arm, export_scene

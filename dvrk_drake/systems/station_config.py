@@ -20,9 +20,8 @@ from dvrk_drake.errors import ArmError, DvrkDrakeError, StationError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.arm_schema import GRAVITIES
-from dvrk_drake.models.effect_kinds import POSITION_KINDS
-from dvrk_drake.models.effects_schema import ArmEffects, DriveEffect
-from dvrk_drake.models.loop_closure import Closure
+from dvrk_drake.models.effects_schema import POSITION_KINDS, ArmEffects, DriveEffect
+from dvrk_drake.models.plant import Closure
 from dvrk_drake.models.ranges import number_fault, within
 from dvrk_drake.models.typed_yaml import load_yaml, typed_content
 from dvrk_drake.systems.arm_station import arm_plant_config

@@ -16,9 +16,9 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem, OutputPort
 from pydrake.systems.primitives import Adder, DiscreteTimeDelay
 
-from dvrk_drake.dynamics.contact import Contact
 from dvrk_drake.dynamics.dynamic_section import ActuatorStatistics
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.kinematics import Contact
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import set_joint_damping
 from dvrk_drake.systems.arm_station import ArmStation

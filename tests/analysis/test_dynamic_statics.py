@@ -20,8 +20,7 @@ from dvrk_drake.dynamics.holding_torque import holding_torque_into, static_model
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, JointStatistics
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.models.effect_kinds import POSITION_KINDS
-from dvrk_drake.models.effects_schema import DriveEffect
+from dvrk_drake.models.effects_schema import POSITION_KINDS, DriveEffect
 
 pytestmark = pytest.mark.numeric
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dvrk_drake.analysis.error_shares import MIN_SHARE, SHARE_LABELS, ErrorShares, error_shares, residual_structure
-from dvrk_drake.analysis.observations.noise import MOTION_FREQUENCY
+from dvrk_drake.analysis.observations.signals import MOTION_FREQUENCY
 
 pytestmark = pytest.mark.numeric
 

@@ -13,8 +13,8 @@ from dvrk_drake.analysis.external_force import estimate_force
 from dvrk_drake.analysis.identification import identify
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.cli import main
-from dvrk_drake.dynamics.contact import PRIOR_FORCE, Contact
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.kinematics import PRIOR_FORCE, Contact
 from dvrk_drake.errors import ArmError, ModelError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.reading import read_recording

@@ -13,7 +13,7 @@ from dvrk_drake.analysis.estimation.motion_effects import common_delay
 from dvrk_drake.analysis.motion_identification import motion_problem
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
-from dvrk_drake.dynamics.dry_friction_bound import MIN_TRAVEL, REST_TIME, REVERSAL_SHARE, DryFrictionBound
+from dvrk_drake.dynamics.momentum_observer import MIN_TRAVEL, REST_TIME, REVERSAL_SHARE, DryFrictionBound
 from dvrk_drake.dynamics.physical_consistency import WIDENING, bounding_boxes
 from dvrk_drake.models.arm_files import derived_arm_file
 

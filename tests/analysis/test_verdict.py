@@ -10,8 +10,7 @@ import pytest
 from command_output import refusal, refused
 from robot_file import write_robot
 
-from dvrk_drake.analysis.validation import validate_static
-from dvrk_drake.analysis.verdict import (
+from dvrk_drake.analysis.results import (
     MIN_STIFFNESS,
     Tolerance,
     coverage,
@@ -22,6 +21,7 @@ from dvrk_drake.analysis.verdict import (
     unfit,
     worst,
 )
+from dvrk_drake.analysis.validation import validate_static
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_section import ActuatorStatistics, DynamicSection
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, ValidationSummary

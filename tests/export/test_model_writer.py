@@ -21,9 +21,8 @@ from dvrk_drake.dynamics.inertial_parameters import LinkInertia, link_inertias, 
 from dvrk_drake.dynamics.model_links import nearest_links
 from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
 from dvrk_drake.errors import ArmError, ModelError
-from dvrk_drake.export.gltf import to_obj
 from dvrk_drake.export.gravity_sources import c_identifier
-from dvrk_drake.export.model_writer import changed_links, to_text, with_inertias, write_model
+from dvrk_drake.export.model_writer import changed_links, to_obj, to_text, with_inertias, write_model
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import arm_sdf, make_arm_plant, set_arm_positions, tree_selector

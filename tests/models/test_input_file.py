@@ -24,7 +24,7 @@ from dvrk_drake.models.files import MAX_TEXT
 from dvrk_drake.models.sdf_model import compose_sdf
 from dvrk_drake.models.typed_yaml import parse_yaml
 from dvrk_drake.processes.simulated_arm import load_driver
-from dvrk_drake.recordings import csv_rows
+from dvrk_drake.recordings import csv_files
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.writing import write_recording
 
@@ -178,7 +178,7 @@ def test_a_model_with_a_missing_key_is_refused(key, tmp_path):
 
 
 def test_memory_for_a_large_csv_is_small(tmp_path, monkeypatch):
-    monkeypatch.setattr(csv_rows, "_BLOCK", 1 << 16)
+    monkeypatch.setattr(csv_files, "_BLOCK", 1 << 16)
     path = tmp_path / "recording.csv"
     path.write_text(f"{HEADER}\n" + f"{ROW}\n" * 20_000)
     shares = []
@@ -201,7 +201,7 @@ def test_block_size_does_not_change_the_rows(block, end, tmp_path, monkeypatch):
     path = tmp_path / "recording.csv"
     write_recording(original, path)
     path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", end.encode()))
-    monkeypatch.setattr(csv_rows, "_BLOCK", block)
+    monkeypatch.setattr(csv_files, "_BLOCK", block)
     read = read_recording(path)
     for name in ("t", "q", "qd", "tau"):
         np.testing.assert_array_equal(getattr(read, name), getattr(original, name))
@@ -214,7 +214,7 @@ def test_block_size_does_not_change_the_rows(block, end, tmp_path, monkeypatch):
 def test_csv_with_too_many_rows_or_too_long_lines_is_refused(tmp_path, monkeypatch):
     path = tmp_path / "recording.csv"
     path.write_text(f"{HEADER}\n" + f"{ROW}\n" * 4)
-    monkeypatch.setattr(csv_rows, "MAX_COUNT", 3)
+    monkeypatch.setattr(csv_files, "MAX_COUNT", 3)
     assert_refused(RecordingError, r", line 5: the file has more than 3 rows\. Split", read_recording, path)
     path.write_text(f"{HEADER}\n" + "1" * 3_000_000)
     assert_refused(RecordingError, "a line has more than 1048576 characters", read_recording, path)

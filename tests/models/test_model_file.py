@@ -10,10 +10,10 @@ from robot_file import URDF, write_robot
 
 from dvrk_drake.errors import ArmError
 from dvrk_drake.export.model_writer import write_model
+from dvrk_drake.models.arm import SoftWalls
 from dvrk_drake.models.arm_files import derived_arm_file, load_arm
 from dvrk_drake.models.plant import add_arm, arm_sdf, holding_torques, inverse_dynamics
 from dvrk_drake.models.sdf_model import compose_sdf
-from dvrk_drake.models.soft_walls import SoftWalls
 
 MJCF = """<mujoco model="lever">
   <compiler angle="radian"/>

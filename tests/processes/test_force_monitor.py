@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from pushed_arm import pushed_arm
 
-from dvrk_drake.dynamics.contact import MAX_DEVIATION
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.dynamics.kinematics import ArmFrame
+from dvrk_drake.dynamics.kinematics import MAX_DEVIATION, ArmFrame
 from dvrk_drake.errors import ControllerError, ModelError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm_files import load_arm

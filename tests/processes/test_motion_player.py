@@ -8,9 +8,9 @@ from command_output import assert_refused
 from sticky_arm import PERIOD, Disk, StickyArm, random_poses, run_collector
 
 from dvrk_drake.analysis.excitation.periodic_motion import FourierBasis, PeriodicMotion
+from dvrk_drake.analysis.excitation.pose_file import offset_pose
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import CollectionError, RecordingError
-from dvrk_drake.models.approach import offset_pose
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes import motion_parts, motion_player
 from dvrk_drake.processes.arm_controller import ArmController

@@ -15,7 +15,7 @@ from dvrk_drake.analysis.check.recording_check import check_recording
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.recordings import csv_rows
+from dvrk_drake.recordings import csv_files
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import Recording
 
@@ -145,7 +145,7 @@ def test_file_without_read_permission_is_refused():
 
 def test_rows_after_simple_blocks_keep_line_numbers(tmp_path, monkeypatch):
     """Blocks of simple rows are parsed together. Rows with quotes and blank lines are parsed one by one."""
-    monkeypatch.setattr(csv_rows, "_BLOCK", 4 * len(ROW))
+    monkeypatch.setattr(csv_files, "_BLOCK", 4 * len(ROW))
     quoted = '"0.1"' + ROW[3:]
     text = f"{HEADER},guard_state\n" + 20 * f"{ROW},3\n" + f"\n{quoted},3\n" + 10 * f"{ROW},3\n"
     recording = read_recording(write_text(tmp_path, text))

@@ -7,9 +7,9 @@ import dataclasses
 import numpy as np
 from motions import fourier_motion, friction_everywhere, true_dynamics
 
-from dvrk_drake.dynamics.contact import Contact
 from dvrk_drake.dynamics.dynamic_section import ActuatorStatistics
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.dynamics.kinematics import Contact
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.recording import Recording
 

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from pushed_arm import pushed_arm
 
-from dvrk_drake.dynamics.contact import PRIOR_FORCE, Contact, is_measurable
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.dynamics.kinematics import ArmFrame
+from dvrk_drake.dynamics.kinematics import PRIOR_FORCE, ArmFrame, Contact, is_measurable
 from dvrk_drake.dynamics.momentum_observer import MomentumObserver
 from dvrk_drake.errors import ArmError, ControllerError, ModelError
 from dvrk_drake.models.arm_files import load_arm

@@ -8,7 +8,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.analysis import Simulator
 
-from dvrk_drake.dynamics.contact import Contact
+from dvrk_drake.dynamics.kinematics import Contact
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.systems.force_feedback import MAX_SHARE, START_ENERGY, ForceFeedback

@@ -9,20 +9,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.check.effort_lag import NUM_INDEPENDENT
-from dvrk_drake.analysis.estimation.estimator import ASSUMED_ERROR, MIN_ERROR, Estimator, Prior
+from dvrk_drake.analysis.estimation.estimator import (
+    ASSUMED_ERROR,
+    EFFECT_DEVIATION,
+    KNOWN_SHARE,
+    MIN_ERROR,
+    TILT_DEVIATION,
+    Estimator,
+    Prior,
+    rigid_deviations,
+)
 from dvrk_drake.analysis.estimation.motion_columns import DIRECTION_WIDTH, BaseColumns, base_columns, named_effects
 from dvrk_drake.analysis.estimation.motion_problem import MIN_INFORMATION
 from dvrk_drake.analysis.estimation.normal_equations import NormalEquations
-from dvrk_drake.analysis.estimation.priors import EFFECT_DEVIATION, KNOWN_SHARE, TILT_DEVIATION, rigid_deviations
-from dvrk_drake.analysis.observations.low_pass import low_pass, resample
 from dvrk_drake.analysis.observations.motion_grid import GRID_RATE, MotionGrid, ends_of
 from dvrk_drake.analysis.observations.observations import Observations
+from dvrk_drake.analysis.observations.signals import low_pass, resample
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.dynamic_model import effect_shapes
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.effect_kinds import EFFECT_KINDS, POSITION_KINDS
-from dvrk_drake.models.effects_schema import DriveEffect
+from dvrk_drake.models.effects_schema import EFFECT_KINDS, POSITION_KINDS, DriveEffect
 from dvrk_drake.recordings.recording import MIN_RANGE, REST_SPEED
 
 #: Prior standard deviation of a position offset [rad], [m]. An offset of a joint is reported only if one of this size

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.estimation.motion_columns import DIRECTION_WIDTH
 from dvrk_drake.analysis.estimation.motion_effects import MIN_ERRORS, MIN_GAIN
-from dvrk_drake.analysis.observations.low_pass import low_pass, minimiser
 from dvrk_drake.analysis.observations.motion_grid import MotionSignals, ends_of
+from dvrk_drake.analysis.observations.signals import low_pass, minimiser
 from dvrk_drake.analysis.observations.true_time import MAX_ROWS
 
 #: Cut-off of the low-pass filter for accelerations, efforts and regressor columns [Hz]. It is above the cut-offs of the

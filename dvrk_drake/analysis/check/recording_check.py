@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from dvrk_drake.analysis.check.channel_check import MIN_GAIN, check_channels, segments_of
 from dvrk_drake.analysis.check.channel_fit import ChannelFit
-from dvrk_drake.analysis.check.motion_check import check_motion, repeated_row_findings
+from dvrk_drake.analysis.check.measurement_check import check_motion, check_poses, repeated_row_findings
 from dvrk_drake.analysis.check.mounting import find_mounting, is_assumed
-from dvrk_drake.analysis.check.pose_check import check_poses
 from dvrk_drake.analysis.check.report import JointSignals, RecordingReport
 from dvrk_drake.analysis.motion_validation import find_other_robot, validate_motion
 from dvrk_drake.analysis.observations.finding import Finding, Severity

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.estimation.estimator import StepwiseSelection
 from dvrk_drake.analysis.estimation.motion_problem import ConsistentFit, ConsistentProgram, DynamicProblem
 from dvrk_drake.analysis.estimation.normal_equations import NormalEquations
-from dvrk_drake.analysis.observations.low_pass import minimiser, resample
 from dvrk_drake.analysis.observations.motion_grid import MotionGrid
 from dvrk_drake.analysis.observations.observations import Observations
+from dvrk_drake.analysis.observations.signals import minimiser, resample
 from dvrk_drake.models.arm_files import has_converted_model
 
 #: Number of iterations that estimate the base tilt and the loads of the drives. Each iteration uses the parameters of

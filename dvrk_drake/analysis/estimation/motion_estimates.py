@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.estimation.motion_columns import RecordingEffect
 from dvrk_drake.analysis.estimation.motion_problem import ConsistentFit, DynamicProblem
 from dvrk_drake.analysis.estimation.normal_equations import NormalEquations
-from dvrk_drake.analysis.observations.low_pass import correlation
+from dvrk_drake.analysis.observations.signals import correlation
 from dvrk_drake.dynamics.dynamic_regressor import derive_base_parameters
 from dvrk_drake.dynamics.dynamic_section import (
     CorrelatedEstimates,
@@ -24,7 +24,7 @@ from dvrk_drake.dynamics.gravity_parameters import gravity_parameters
 from dvrk_drake.dynamics.identified_model import BaseParameterEstimate
 from dvrk_drake.dynamics.physical_consistency import reached_bounds
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.effect_kinds import EFFECT_KINDS
+from dvrk_drake.models.effects_schema import EFFECT_KINDS
 
 #: Largest absolute correlation of two parameters that are identifiable separately. At this value, the standard error of
 #: each is 1 / sqrt(1 - 0.95^2) = 3.2 times that with the other parameter known.

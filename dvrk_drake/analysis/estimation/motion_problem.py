@@ -9,10 +9,16 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.estimation.estimator import ASSUMED_ERROR, Prior, StepwiseSelection
+from dvrk_drake.analysis.estimation.estimator import (
+    ASSUMED_ERROR,
+    KNOWN_SHARE,
+    TILT_DEVIATION,
+    Prior,
+    StepwiseSelection,
+    rigid_deviations,
+)
 from dvrk_drake.analysis.estimation.motion_columns import DynamicColumns, RecordingEffect
 from dvrk_drake.analysis.estimation.normal_equations import NormalEquations, OwnColumns, fold_sums
-from dvrk_drake.analysis.estimation.priors import KNOWN_SHARE, TILT_DEVIATION, rigid_deviations
 from dvrk_drake.analysis.observations.motion_grid import MotionGrid
 from dvrk_drake.dynamics.dynamic_model import is_loaded, transmitted_effort
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
@@ -23,7 +29,7 @@ from dvrk_drake.dynamics.physical_consistency import (
     consistent_parameters,
     log_det_curvature,
 )
-from dvrk_drake.models.effect_kinds import EFFECT_KINDS
+from dvrk_drake.models.effects_schema import EFFECT_KINDS
 
 #: Prior standard deviation of the torque of the second harmonic of a known cable with a first harmonic, as a share of
 #: the RMS effort. It is a correction; a wide prior would let it diverge outside the range of the motion.

@@ -9,9 +9,8 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.estimation.estimator import ASSUMED_ERROR
+from dvrk_drake.analysis.estimation.estimator import ASSUMED_ERROR, KNOWN_SHARE, rigid_deviations
 from dvrk_drake.analysis.estimation.motion_columns import COULOMB_WIDTHS, BaseColumns, base_columns
-from dvrk_drake.analysis.estimation.priors import KNOWN_SHARE, rigid_deviations
 from dvrk_drake.analysis.excitation.motion_limits import MotionLimits
 from dvrk_drake.analysis.excitation.predicted_effort import PredictedEffort
 from dvrk_drake.analysis.excitation.random_motion import random_motion, state_of
@@ -19,7 +18,7 @@ from dvrk_drake.analysis.observations.repetition import CORRELATION_TIME
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor, derive_base_parameters
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.effect_kinds import EFFECT_KINDS
+from dvrk_drake.models.effects_schema import EFFECT_KINDS
 
 #: Number, period [s] and number of harmonics of the random motions for which the expected error is computed, and number
 #: of states per motion. The period and the harmonics state the task: speeds up to 0.6 Hz. Half or twice the number of

@@ -15,13 +15,12 @@ from dvrk_drake.analysis.excitation.periodic_motion import PeriodicMotion
 from dvrk_drake.analysis.excitation.predicted_effort import PredictedEffort
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ExcitationError
-from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm import Arm, SoftWalls
 from dvrk_drake.models.arm_files import is_from_model_file
 from dvrk_drake.models.arm_schema import POSITIONS
 from dvrk_drake.models.environment import Environment
 from dvrk_drake.models.plant import add_arm, base_body, set_arm_positions
 from dvrk_drake.models.ranges import number_fault, within
-from dvrk_drake.models.soft_walls import SoftWalls
 
 
 class CollisionDetector:

@@ -1,4 +1,4 @@
-"""Files of the command `collect`: the poses to measure (YAML) and the measured poses (CSV)."""
+"""Poses that the command `collect` measures (YAML), their approach, and the measured poses (CSV)."""
 
 # This file has no postponed annotations, because yaml_load_typed reads the types at run time.
 import os
@@ -13,13 +13,11 @@ from numpy.typing import NDArray
 from dvrk_drake.errors import CollectionError, RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.environment import Environment
-from dvrk_drake.models.files import atomic_write, read_input
+from dvrk_drake.models.files import GrowingFile, atomic_write, csv_line, read_input
 from dvrk_drake.models.ranges import within
 from dvrk_drake.models.typed_yaml import load_typed_yaml
-from dvrk_drake.recordings.csv_rows import parse_finite, read_rows
-from dvrk_drake.recordings.growing_file import GrowingFile, csv_line
+from dvrk_drake.recordings.csv_files import column_names, parse_finite, read_rows
 from dvrk_drake.recordings.recording import SAME_POSE, Recording
-from dvrk_drake.recordings.writer_csv import column_names
 
 #: Tolerance of the limits [rad, m], because the positions in a file may be rounded.
 _ROUNDING = 1e-9
@@ -252,3 +250,33 @@ class CollectionFile:
         raise CollectionError(
             f"{self._path} already exists and is not a collection of {self._arm.name}. Choose another output file."
         )
+
+
+#: Length of an approach, as a fraction of the range of the joint. Dry friction is elastic at first, so a short approach
+#: does not reverse it completely. Random poses have at least a tenth of the range on both sides.
+APPROACH = 0.08
+
+
+def approach_offset(arm: Arm) -> NDArray[np.float64]:
+    """Returns the offset (n,) of the pose at which the approach of a static pose begins [rad, m].
+
+    The offset is subtracted for the approach from below and added for the approach from above, see `offset_pose`. The
+    offsets of all joints have the same sign, because this reverses the dry friction of actuators that are coupled to
+    several joints most completely.
+    """
+    return np.asarray(APPROACH * (arm.position_upper - arm.position_lower))
+
+
+def offset_pose(arm: Arm, pose: NDArray[np.float64], offset: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns pose + offset (n,), with the offset of each joint reduced so that no limit of `arm` is violated.
+
+    If the reduced offsets still violate a coupled limit, `pose` is returned unchanged.
+    """
+    A, lower, upper = arm.limit_matrix()
+    change = A @ offset
+    room = np.where(change > 0, upper - A @ pose, A @ pose - lower)
+    share = np.clip(np.divide(room, np.abs(change), out=np.ones_like(room), where=change != 0), 0.0, 1.0)
+    joint_share = np.array([share[A[:, j] != 0].min() for j in range(arm.num_joints)])
+    point = pose + joint_share * offset
+    # If coefficients have both signs, reducing the offset of one joint may violate a coupled limit.
+    return pose if arm.limit_violations(point, 1e-9) else point

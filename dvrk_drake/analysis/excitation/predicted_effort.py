@@ -13,8 +13,7 @@ from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.dynamics.holding_torque import HoldingArrays, holding_torques_into
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.effect_kinds import EFFECT_KINDS
-from dvrk_drake.models.effects_schema import DriveEffect
+from dvrk_drake.models.effects_schema import EFFECT_KINDS, DriveEffect
 from dvrk_drake.models.plant import inverse_dynamics
 
 

@@ -13,13 +13,12 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.estimation.pose_effects import MIN_TORQUE, StaticProblem, candidate_effects
 from dvrk_drake.analysis.excitation.information import ExpectedError
 from dvrk_drake.analysis.excitation.motion_limits import PATH_STEP, ROUNDING, CollisionDetector, MotionLimits
-from dvrk_drake.analysis.excitation.pose_file import save_poses
+from dvrk_drake.analysis.excitation.pose_file import approach_offset, offset_pose, save_poses
 from dvrk_drake.analysis.excitation.predicted_effort import PredictedEffort
 from dvrk_drake.analysis.excitation.random_motion import middle_pose
 from dvrk_drake.analysis.observations.static_poses import MIN_POSES
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.errors import ExcitationError
-from dvrk_drake.models.approach import approach_offset, offset_pose
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.environment import Environment
 from dvrk_drake.models.files import Reportable, refuse_existing

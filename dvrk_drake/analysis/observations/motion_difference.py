@@ -15,8 +15,7 @@ from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.observations.repetition import SAME_MOTION
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.errors import RecordingError
-from dvrk_drake.models.effect_kinds import EFFECT_KINDS
-from dvrk_drake.models.effects_schema import half_width
+from dvrk_drake.models.effects_schema import EFFECT_KINDS, half_width
 from dvrk_drake.recordings.recording import Recording
 
 #: Roles of friction effects. All effects of one role at a coordinate change together, for example with temperature or

@@ -11,7 +11,7 @@ from scipy.ndimage import maximum_filter1d
 from dvrk_drake.analysis.observations.finding import Finding
 from dvrk_drake.analysis.observations.true_time import MAX_ROWS, velocity_agreement
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.recordings.csv_rows import listed
+from dvrk_drake.recordings.csv_files import listed
 from dvrk_drake.recordings.recording import (
     GAP,
     MAX_PERIOD,

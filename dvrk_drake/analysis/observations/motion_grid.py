@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dvrk_drake.analysis.observations.low_pass import central_difference, low_pass, resample
+from dvrk_drake.analysis.observations.signals import central_difference, low_pass, resample
 from dvrk_drake.analysis.observations.true_time import TrueTime, velocity_agreement
 from dvrk_drake.dynamics.dynamic_section import SignalSettings
 from dvrk_drake.models.arm import Arm

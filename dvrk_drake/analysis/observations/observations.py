@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.observations.finding import Finding
-from dvrk_drake.analysis.observations.low_pass import central_difference, low_pass, resample
 from dvrk_drake.analysis.observations.motion_faults import jump_fault, source_fault, time_fault
 from dvrk_drake.analysis.observations.motion_grid import GRID_RATE, MIN_DURATION, MotionGrid, even_times
 from dvrk_drake.analysis.observations.repetition import find_period
+from dvrk_drake.analysis.observations.signals import central_difference, low_pass, resample
 from dvrk_drake.analysis.observations.static_poses import MIN_POSES, static_poses
 from dvrk_drake.analysis.observations.true_time import TrueTime, increasing_times, true_time
 from dvrk_drake.dynamics.dynamic_section import SignalSettings

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 
-from dvrk_drake.analysis.observations.low_pass import low_pass, minimiser, resample
 from dvrk_drake.analysis.observations.motion_grid import MotionGrid, ends_of
+from dvrk_drake.analysis.observations.signals import low_pass, minimiser, resample
 from dvrk_drake.recordings.recording import SAME_POSE
 
 #: Largest difference D(T) of the positions of a motion that repeats after the period T, see `find_period`. Half or

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.observations.low_pass import low_pass
+from dvrk_drake.analysis.observations.signals import low_pass
 from dvrk_drake.analysis.observations.true_time import CUT_OFF, ORDER
 from dvrk_drake.errors import IdentificationError, RecordingError
 from dvrk_drake.models.arm import Arm

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.analysis.observations.low_pass import central_difference, low_pass, resample
+from dvrk_drake.analysis.observations.signals import central_difference, low_pass, resample
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.recordings.recording import MIN_ROWS, REST_SPEED, Recording
 

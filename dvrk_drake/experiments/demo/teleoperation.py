@@ -16,7 +16,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial, PiecewisePose
 
-from dvrk_drake.dynamics.contact import Contact
+from dvrk_drake.dynamics.kinematics import Contact
 from dvrk_drake.experiments.demo.teleoperation_scene import TeleoperationScene
 from dvrk_drake.experiments.simulation import recorded_in
 from dvrk_drake.models.arm_files import load_arm

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from dvrk_drake.errors import RecordingError, StudyError
 from dvrk_drake.experiments.study.measures import Measure
 from dvrk_drake.experiments.study.study_file import Case, Study
-from dvrk_drake.models.files import atomic_write, read_input
-from dvrk_drake.recordings.growing_file import GrowingFile
-from dvrk_drake.recordings.writer_csv import column_names
+from dvrk_drake.models.files import GrowingFile, atomic_write, read_input
+from dvrk_drake.recordings.csv_files import column_names
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,7 @@ from dvrk_drake.dynamics.compiled import entry_point
 from dvrk_drake.dynamics.holding_torque import HoldingArrays, holding_torque_into
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.effect_kinds import POSITION_KINDS
-from dvrk_drake.models.effects_schema import ArmEffects, EffortEffect, per_actuator
+from dvrk_drake.models.effects_schema import POSITION_KINDS, ArmEffects, EffortEffect, per_actuator
 from dvrk_drake.systems.arm_effects.dry_friction import PlantEffects
 from dvrk_drake.systems.ideal_drive import PlantJoints
 

@@ -13,8 +13,7 @@ from pydrake.multibody.tree import Joint, JointActuator, ModelInstanceIndex, PdC
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, effect_fault
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.effect_kinds import EFFECT_KINDS
-from dvrk_drake.models.effects_schema import FRICTION_KINDS, ArmEffects, FrictionEffect
+from dvrk_drake.models.effects_schema import EFFECT_KINDS, FRICTION_KINDS, ArmEffects, FrictionEffect
 from dvrk_drake.systems.arm_effects.drive_joints import DriveJoints
 from dvrk_drake.systems.ideal_drive import PlantJoints, plant_config_fault
 

@@ -12,7 +12,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context
 
-from dvrk_drake.dynamics.contact import MAX_DEVIATION
+from dvrk_drake.dynamics.kinematics import MAX_DEVIATION
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.systems.arm_view.drawn_arm import Visibility
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
-from dvrk_drake.models.soft_walls import SoftWalls
+from dvrk_drake.models.arm import SoftWalls
 from dvrk_drake.systems.guard.settings import GuardSettings
 
 if TYPE_CHECKING:

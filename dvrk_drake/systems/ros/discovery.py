@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from dvrk_drake.errors import ControllerError, RecordingError
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.recordings.topic_choice import MEASURED_JS, check_namespace, choose_topic, fitting_topics
+from dvrk_drake.recordings.reader_options import MEASURED_JS, check_namespace, choose_topic, fitting_topics
 
 if TYPE_CHECKING:
     from dvrk_drake.systems.ros.domain import RosDomain

@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from dvrk_drake.errors import DvrkDrakeError
-from dvrk_drake.models.mounting import GRAVITY
+from dvrk_drake.models.arm import GRAVITY
 from dvrk_drake.systems.ros.discovery import topic_fault
 from dvrk_drake.systems.ros.open_domain import open_ros_domain
 

@@ -18,7 +18,7 @@ from dvrk_drake.analysis.estimation.motion_estimates import (
     toeplitz_product,
 )
 from dvrk_drake.analysis.estimation.normal_equations import NormalEquations
-from dvrk_drake.analysis.observations.low_pass import low_pass
+from dvrk_drake.analysis.observations.signals import low_pass
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm_files import load_arm
 

@@ -153,7 +153,7 @@ def test_other_existing_output_is_refused_and_unchanged(tmp_path):
 def test_written_rows_survive_kill(tmp_path):
     """Kills a process that appends rows. The written rows are complete, in order and without gaps."""
     code = (
-        "import sys\nfrom dvrk_drake.recordings.growing_file import GrowingFile\n"
+        "import sys\nfrom dvrk_drake.models.files import GrowingFile\n"
         "file, k = GrowingFile(sys.argv[1], sync=True), 0\n"
         "while True:\n    file.append(b'%d,%s\\n' % (k, b'x' * 4000)); k += 1\n    print(k, flush=True)\n"
     )
@@ -172,7 +172,7 @@ def test_written_rows_survive_kill(tmp_path):
 
 def test_full_disk_leaves_complete_rows(tmp_path):
     code = (
-        "import resource, signal, sys\nfrom dvrk_drake.recordings.growing_file import GrowingFile\n"
+        "import resource, signal, sys\nfrom dvrk_drake.models.files import GrowingFile\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (1050, 1050))\n"
         "file = GrowingFile(sys.argv[1], sync=True)\n"

@@ -9,11 +9,10 @@ from command_output import refused
 import dvrk_drake as dvrk
 from dvrk_drake.analysis.excitation import static_poses
 from dvrk_drake.analysis.excitation.motion_limits import CollisionDetector, MotionLimits, first_collision, tip_positions
-from dvrk_drake.analysis.excitation.pose_file import load_poses
+from dvrk_drake.analysis.excitation.pose_file import approach_offset, load_poses, offset_pose
 from dvrk_drake.analysis.excitation.static_poses import MARGIN, MIN_APPROACH, PoseChecker, PoseInformation, _ordered
 from dvrk_drake.cli import main
 from dvrk_drake.errors import ExcitationError
-from dvrk_drake.models.approach import approach_offset, offset_pose
 from dvrk_drake.models.environment import Environment
 from dvrk_drake.processes.arm_controller import MotionStyle
 from dvrk_drake.processes.collector import CollectionSettings, approaches

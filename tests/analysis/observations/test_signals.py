@@ -4,12 +4,21 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from dvrk_drake.analysis.observations import low_pass as module
-from dvrk_drake.analysis.observations.low_pass import ORDER, central_difference, correlation, low_pass, resample
+from dvrk_drake.analysis.observations import signals as module
 from dvrk_drake.analysis.observations.motion_difference import Whitening
-from dvrk_drake.analysis.observations.noise import MOTION_FREQUENCY, cut_offs, narrow_band, spectra
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.observations.repetition import find_period, motion_floor, repeatability_floor
+from dvrk_drake.analysis.observations.signals import (
+    MOTION_FREQUENCY,
+    ORDER,
+    central_difference,
+    correlation,
+    cut_offs,
+    low_pass,
+    narrow_band,
+    resample,
+    spectra,
+)
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.recording import Recording
 

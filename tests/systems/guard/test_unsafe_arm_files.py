@@ -8,7 +8,7 @@ from arm_copies import copy_arm
 
 from dvrk_drake.errors import StationError
 from dvrk_drake.models.arm_files import known_arms, load_arm
-from dvrk_drake.models.linear_map import LinearMap
+from dvrk_drake.models.arm_schema import LinearMap
 from dvrk_drake.models.sdf_model import MODELS_FOLDER
 from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.guard.unsafe_arm import unsafe_difference

@@ -9,7 +9,7 @@ from pydrake.math import RollPitchYaw
 pytest.importorskip("cyclonedds", reason="needs cyclonedds")
 
 from dvrk_drake.errors import DvrkDrakeError
-from dvrk_drake.models.mounting import mount_gravity
+from dvrk_drake.models.arm import mount_gravity
 from dvrk_drake.systems.ros.messages import Pose, PoseStamped, Quaternion
 from dvrk_drake.systems.ros.mount_topic import topic_gravity
 

@@ -1,4 +1,4 @@
-"""Reads the rows of CSV files with their line numbers."""
+"""Reads the rows of CSV files with their line numbers, and writes tables of numbers as CSV files."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.errors import RecordingError
-from dvrk_drake.models.files import open_input
+from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.files import atomic_write, open_input
 
 #: Size of the blocks in which a file is read [bytes], and maximum number of characters of a line.
 _BLOCK, _MAX_LINE = 1 << 20, 1 << 20
@@ -276,3 +277,50 @@ def parse_finite(cell: str, where: str) -> float:
     if not math.isfinite(value):
         raise RecordingError(f"{where} is {cell}; only finite numbers are allowed" if cell else f"{where} is empty")
     return value
+
+
+#: Units of the quantities in a CSV, for a revolute and for a prismatic joint.
+UNITS = {
+    "t": ("s", "s"),
+    **dict.fromkeys(("q", "pose"), ("rad", "m")),
+    "qd": ("rad/s", "m/s"),
+    **dict.fromkeys(("force", "force_lower", "force_upper"), ("N", "N")),
+    **dict.fromkeys(("tau", "lower", "upper", "lower_other_day", "upper_other_day", "friction"), ("N m", "N")),
+}
+
+
+def column_names(prefix: str, num_joints: int, arm: Arm | None = None) -> list[str]:
+    """Returns the column names of a quantity in a CSV, e.g. "q1". With `arm`, they contain the units, e.g. "q1 [rad]".
+
+    Args:
+        prefix: Name of the quantity, a key of `UNITS` if `arm` is given.
+        num_joints: Number of columns, except for the time t.
+        arm: Arm that defines which joints are prismatic.
+    """
+    names = ["t"] if prefix == "t" else [f"{prefix}{i + 1}" for i in range(num_joints)]
+    if arm is None:
+        return names
+    return [f"{name} [{UNITS[prefix][bool(arm.prismatic[i])]}]" for i, name in enumerate(names)]
+
+
+def write_csv(
+    path: str | Path, blocks: Mapping[str, NDArray[np.float64]], arm: Arm | None, stated: Mapping[str, str]
+) -> None:
+    """Writes a table of numbers atomically and with full precision.
+
+    Args:
+        path: Path of the file. An existing file is replaced.
+        blocks: Mapping from the prefix of the columns (key of `UNITS`) to their numbers (m, n), or (m,) for the time t.
+        arm: Arm that defines the units of the columns. None: the names of the columns have no units.
+        stated: Mapping from the names of further columns to the text in each of their rows. Empty texts are omitted.
+
+    Raises:
+        DvrkDrakeError: The folder does not exist or cannot be written.
+    """
+    tables = {prefix: block if block.ndim == 2 else block[:, None] for prefix, block in blocks.items()}
+    stated = {name: text for name, text in stated.items() if text}
+    header = [name for prefix, table in tables.items() for name in column_names(prefix, table.shape[1], arm)]
+    with atomic_write(path) as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow([*header, *stated])
+        writer.writerows([*map(repr, row), *stated.values()] for row in np.hstack(list(tables.values())).tolist())
