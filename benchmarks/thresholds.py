@@ -1,6 +1,6 @@
 """Prints what half and twice the value of a constant change, for the reasons beside the constants of `analysis`.
 
-    python benchmarks/thresholds.py FOLDER check.motion_check.MIN_JITTER ... [--results motions poses payloads design]
+    python benchmarks/thresholds.py FOLDER check.measurement_check.MIN_JITTER ... [--results motions poses payloads design]
 
 FOLDER contains the folders trajectories, psm_three_joints and mtm_static with the public recordings
 (docs/public_recordings.md). A constant is named by its module in `dvrk_drake.analysis`. The output lists the findings
@@ -126,7 +126,7 @@ def main() -> None:
     """Prints the changes, one line each."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="folder of the recordings, see above")
-    parser.add_argument("names", nargs="+", help="constants, e.g. check.motion_check.MIN_JITTER")
+    parser.add_argument("names", nargs="+", help="constants, e.g. check.measurement_check.MIN_JITTER")
     parser.add_argument("--results", nargs="+", default=(), choices=("motions", "poses", "payloads", "design"))
     options = parser.parse_args()
     before = _in_process(options.names[0], 1.0, options.folder, tuple(options.results))
