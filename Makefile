@@ -12,7 +12,7 @@ BIN := $(VENV)/bin
 # Without stored bytecode, each process compiles the package and the tests again: 12 s of CPU time per test worker.
 export PYTHONDONTWRITEBYTECODE :=
 # Files with network tests. Pytest would import all other files, too.
-NETWORK_FILES = $(shell grep -rl --include='test_*.py' '^pytestmark.*mark\.network' tests | grep -v 'udp/\|test_retries')
+NETWORK_FILES = $(shell grep -rl --include='test_*.py' '^pytestmark.*mark\.network' tests | grep -v 'udp/')
 AND_TESTS = $(if $(TESTS), and $(TESTS))
 
 .PHONY: demo test test-all test-busy test-local test-network test-realtime mutants lint docs package test-package benchmark clean

@@ -15,7 +15,6 @@ from dvrk_drake.analysis.motion_identification import identify_dynamic
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.payload import (
     PayloadIdentification,
-    better_link_warnings,
     equally_good_links,
     estimate_payload,
 )
@@ -115,40 +114,6 @@ def test_largest_mass_is_printed_without_payload():
 
 def result_of(payload, estimates):
     return PayloadIdentification(payload, estimates, IdentifiedModel.from_arm(load_arm("psm")), link=payload.link)
-
-
-def assert_end_link_explains(estimates):
-    """Asserts that estimates on other links have a warning about a payload on the end link."""
-    by_link = {payload.link: payload for payload in estimates}
-    wrong = [by_link["insertion_link"], by_link["bottom_bar_link"]]
-    for payload in wrong:
-        (warning,) = map(str, better_link_warnings(payload, estimates))
-        assert f"{payload.link}: a payload on" in warning and "on end_link" in warning
-        assert "\n" not in warning and "--link end_link" in warning
-        assert payload.as_dict(estimates)["better_links"][0] == "end_link"
-        text = " ".join(printed(payload_page(result_of(payload, estimates))).split())
-        assert "below" not in text
-        assert "A payload on end_link explains the change" in text
-    assert not wrong[0].found and wrong[0].as_dict(estimates)["largest_at_com"] is None
-    end = by_link["end_link"]
-    assert not better_link_warnings(end, estimates) and end.as_dict(estimates)["better_links"] == []
-
-
-LINKS = ["insertion_link", "bottom_bar_link", "end_link"]
-
-
-def test_reports_a_payload_on_another_link():
-    name, link, mass, position = CASES["end"]
-    model, reference, loaded = two_days(name, link, mass, position, 0)
-    assert_end_link_explains(point_masses(reference, loaded, model, LINKS))
-
-
-def test_without_payload_no_link_is_better():
-    model, reference, other = two_days("psm", "end_link", 0.0, [0.0, 0.0, 0.0], 0)
-    estimates = point_masses(reference, other, model, LINKS)
-    for payload in estimates:
-        assert not better_link_warnings(payload, estimates)
-        assert payload.as_dict(estimates)["largest_at_com"] > 0
 
 
 def test_aligns_a_reference_that_begins_later():

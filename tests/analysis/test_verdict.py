@@ -269,16 +269,6 @@ def test_cross_validated_verdicts_use_the_same_rule(truth):
     assert list(cross_validated_verdicts(model).values()) == (["good", "do not use"] * 4)[:7]
 
 
-def test_joint_that_did_not_move_is_not_judged(truth):
-    recording = poses(truth)
-    q = recording.q.copy()
-    q[:, 4] = 0.3
-    validation = validate_static(truth, Recording(q=q, tau=truth.holding_torque(q)))
-    assert validation.verdicts["wrist_pitch"] == "not judged" and validation.joints[4].coverage == 0
-    assert validation.verdicts["shoulder_pitch"] == "good"
-    assert validation.unfit("usable") == ["wrist_pitch (not judged)"]
-
-
 def test_negligible_model_torque_is_off(truth):
     """The outer yaw of an upright MTM has no gravity torque, and an identified torque of it is due to noise."""
     recording, friction = poses(truth), ARM.dry_friction()[0]

@@ -20,7 +20,6 @@ from dvrk_drake.dynamics.holding_torque import static_model
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.models.sdf_model import MODELS_FOLDER
 from dvrk_drake.processes import arm_session, simulated_arm
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import Recording
@@ -90,28 +89,6 @@ def test_predict_uses_the_coordinates_of_the_recording(folder, tmp_path, coordin
     expected = IdentifiedModel.load(folder / "model.yaml").holding_torque(q)
     tau = rows if coordinates == "joint" else rows @ arm.transmission.matrix
     np.testing.assert_allclose(tau, expected, atol=1e-12)
-
-
-def test_predict_of_a_psm_in_wpi_coordinates_writes_them(tmp_path):
-    """In these coordinates, the roll is that of the joint. The power is the same in all coordinates."""
-    arm = load_arm("psm")
-    path, model, out = tmp_path / "poses.csv", tmp_path / "model.yaml", tmp_path / "tau.csv"
-    joints = Recording(q=arm.sample_poses(20, np.random.default_rng(0)))
-    actuators, roll = joints.in_actuator_coordinates(arm).q, arm.joint_names.index("roll")
-    wpi = actuators.copy()
-    wpi[:, roll] = joints.q[:, roll]
-    write_recording(Recording(q=wpi), path)
-    text = path.read_text().replace("joint", "wpi")
-    path.write_text(text)
-    IdentifiedModel.from_arm(arm).save(model)
-    assert main(["predict", str(path), "--model", str(model), "--output", str(out)]) == 0
-    tau, expected = csv_block(out, "tau"), IdentifiedModel.load(model).holding_torque(joints.q)
-    assert np.abs(expected).max() > 0.1
-    velocity = np.random.default_rng(1).normal(size=7)
-    velocity_wpi = arm.transmission.velocity(velocity)
-    velocity_wpi[roll] = velocity[roll]
-    np.testing.assert_allclose(tau @ velocity_wpi, expected @ velocity, atol=1e-9)
-    assert out.read_text().splitlines()[1].endswith(",wpi,PSM")
 
 
 def test_exported_python_and_c_match_the_plant(tmp_path, capsys):
@@ -267,42 +244,6 @@ def test_commands_print_the_written_paths(command, written, folder, tmp_path, mo
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("wrote ")]
     assert sorted({line.split()[1].rstrip(":") for line in lines}) == written
     assert {path.name for path in tmp_path.iterdir()} >= set(written)
-
-
-def test_overwrite_replaces_an_existing_output(tmp_path, capsys):
-    out = tmp_path / "g.c"
-    out.write_text("mine")
-    assert main(["equations", "--arm", "mtml", "--format", "c", "--output", str(out), "--overwrite"]) == 0
-    assert "mtml_gravity_torque" in out.read_text()
-    assert capsys.readouterr().out == f"wrote {out}\n"
-
-
-def test_commands_accept_an_arm_file(folder, tmp_path, capsys):
-    """The arm file has a calibrated coupled limit. The model stores the path of the arm file."""
-    text = (MODELS_FOLDER / "arms/mtmr.yaml").read_text().replace("name: MTMR", "name: OURS")
-    arm_file = tmp_path / "ours.yaml"
-    limit = "coupled_limits: [{name: p, coefficients: {shoulder_pitch: 1, elbow_pitch: 1}, lower: -0.22, upper: 0.5}]"
-    arm_file.write_text(text + limit)
-    arm = load_arm(str(arm_file))
-    assert (arm.coupled_limits[0].lower, arm.coupled_limits[0].upper) == (-0.22, 0.5)
-    model = tmp_path / "model.yaml"
-    assert main(["identify", f"{folder}/poses.csv", "--arm", str(arm_file), "--output", str(model)]) == 0
-    assert main(["validate", f"{folder}/other.csv", "--model", str(model)]) == 0
-    capsys.readouterr()
-    (tmp_path / "other.yaml").write_text(text + limit.replace("elbow_pitch", "elbow"))
-    assert 'coupled_limits.p: unknown joint "elbow"; allowed: outer_yaw' in refused(
-        capsys, "equations", "--arm", tmp_path / "other.yaml"
-    )
-
-
-def test_validate_writes_null_for_a_joint_without_effort(folder, tmp_path):
-    recording = read_recording(folder / "other.csv")
-    tau = recording.tau.copy()
-    tau[:, 6] = 0.0
-    write_recording(Recording(q=recording.q, tau=tau), tmp_path / "other.csv")
-    command = ["validate", str(tmp_path / "other.csv"), "--model", f"{folder}/model.yaml"]
-    assert main([*command, "--json", str(tmp_path / "v.json")]) == 0
-    assert json.loads((tmp_path / "v.json").read_text())["joints"][6]["relative_error"] is None
 
 
 def test_model_of_another_arm_is_named(folder, tmp_path, capsys):

@@ -10,7 +10,6 @@ from figure_rules import checked_figures
 from report_pages import printed
 from scipy.optimize import brentq
 
-from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.experiments.scenario import load_scenario
 from dvrk_drake.experiments.tuning.bench import Bench, JointOnBench, Response, band, step_size
@@ -40,11 +39,9 @@ from dvrk_drake.experiments.tuning.tuning import (
     measure_step,
     tune_arm,
 )
-from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.arm_schema import Gains, load_gains, save_gains
 from dvrk_drake.models.effects_schema import ArmEffects, DelayEffect, DriveEffect
-from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.reports.image_files import write_images
 from dvrk_drake.reports.tuning import tuning_page
 from dvrk_drake.workers import local_executor
@@ -199,22 +196,6 @@ def test_least_damped_mode_identifies_joint():
         np.testing.assert_allclose(shares, np.eye(2)[joint], atol=1e-9)
 
 
-def test_unstable_loop_has_no_margins():
-    assert SampledLoop(0.1, Sampling()).margins(single(100.0, 0.0)).phase == 0.0
-
-
-def test_uncoupled_joints_match_single_joints():
-    sampling, gains = Sampling(), Gains([20.0, 3.0], [2.0, 0.2], [30.0, 1.0])
-    together = SampledLoop(np.diag([0.1, 0.01]), sampling).closed_loop(gains)
-    alone = [
-        SampledLoop(M, sampling).closed_loop(Gains([gains.kp[j]], [gains.kd[j]], [gains.ki[j]]))
-        for j, M in enumerate((0.1, 0.01))
-    ]
-    found = np.sort(np.abs(np.linalg.eigvals(together)))
-    expected = np.sort(np.abs(np.concatenate([np.linalg.eigvals(A) for A in alone])))
-    np.testing.assert_allclose(found[-8:], expected[-8:], atol=1e-9)
-
-
 def test_design_keeps_margins_and_reports_limitation():
     sampling = Sampling()
     joint = JointProperties(
@@ -306,40 +287,6 @@ def test_scenario_reads_gains_file(tmp_path):
     scenario = tmp_path / "scenario.yaml"
     scenario.write_text(f"arm: mtml\ncontroller: {{gains: {path}}}\n")
     assert load_scenario(str(scenario)).controller.gains == gains
-
-
-def test_mode_hold_uses_gains_of_file(tmp_path):
-    arm, error = load_arm("mtml"), 0.01
-    n, sender_commands = arm.num_joints, []
-    status = lcmt_dvrk_status()
-    status.arm_name, status.num_joints = arm.name, n
-    status.position, status.velocity, status.effort_measured = [0.1] * n, [0.0] * n, [0.0] * n
-    status.guard_state = lcmt_dvrk_status.STATE_EFFORT
-    for factor in (1.0, 3.0):
-        path = tmp_path / "gains.yaml"
-        save_gains(Gains([factor * 0.1] * n, [0.0] * n, [0.0] * n), path, "no integral")
-        controller = ArmController(arm, IdentifiedModel.from_arm(arm), "hold", 1e-3, gains=load_gains(path))
-        status.command_sender_id = controller.sender_id
-        desired = np.concatenate([np.full(n, 0.1 + error), np.zeros(n)])
-        answers = [controller.answer(status, 1e-3 * k, desired) for k in range(1200)]  # the ramp takes a second
-        assert controller.ramped
-        sender_commands.append(np.array(answers[-1].effort))
-    np.testing.assert_allclose(sender_commands[1] - sender_commands[0], 2 * 0.1 * error, atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("kp: [1]\nkd: [1]\n", "ki is missing"),
-        ("kp: [1]\nkd: [1]\nkI: [1]\n", 'key "kI" is unknown; did you mean "ki"\\? allowed in a gains file: kp, kd,'),
-        ("- 1\n", "must have keys and values, not .*; allowed in a gains file: kp, kd, ki"),
-    ],
-)
-def test_rejects_invalid_gains_files(tmp_path, text, message):
-    path = tmp_path / "gains.yaml"
-    path.write_text(text)
-    with pytest.raises(ControllerError, match=message):
-        load_gains(path)
 
 
 def test_commands_reject_invalid_options(tmp_path, capsys):

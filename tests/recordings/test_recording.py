@@ -72,11 +72,6 @@ def test_missing_efforts_are_reported_when_required(tmp_path):
     assert_refused(RecordingError, r"^the recording has no efforts", replace(recording, source="").measured_effort)
 
 
-def test_row_without_a_file_is_named_by_its_number():
-    assert random_recording().where(2) == "recording, row 3"
-    assert random_recording(source="simulated").where(2) == "simulated, row 3"
-
-
 WANTED = r"needs (a header with )?q1\.\.q7 and tau1\.\.tau7 \(t and qd1\.\.qd7 optional\)"
 MULTI_LINE = '"a\nb"'
 ERRORS = {
@@ -161,16 +156,6 @@ def test_an_empty_recording_is_refused_with_one_line():
     assert [finding.what for finding in check_recording(Observations(empty, load_arm("mtml"))).refusals] == [
         "has no rows"
     ]
-
-
-def test_limits_of_an_arm_with_only_prismatic_joints_are_checked():
-    psm = load_arm("psm")
-    lower, upper = np.full(7, -0.1), np.full(7, 0.1)
-    arm = replace(psm, prismatic=np.ones(7, bool), position_lower=lower, position_upper=upper)
-    with pytest.raises(
-        RecordingError, match=r"yaw \(q1\) = 90 is outside .* m of PSM .*\. Are the positions in millimetres"
-    ):
-        Recording(q=np.full((3, 7), 90.0)).check_fits(arm)
 
 
 # Tests whether recordings, including real ones, match an arm in joint or actuator coordinates.

@@ -1,8 +1,8 @@
 """Controller process for tests that regulates the first received pose of the arm with effort commands.
 
-    python lcm_controller.py ARM [--echo] [--lcm-url URL]
+    python lcm_controller.py ARM [--lcm-url URL]
 
-With --echo, the process only answers with HOLD commands. It uses real-time scheduling if that is permitted.
+The process uses real-time scheduling if that is permitted.
 """
 
 import sys
@@ -11,15 +11,15 @@ import lcm
 import numpy as np
 from effort_controller import effort_command
 
-from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
+from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes.pace import make_realtime
 from dvrk_drake.systems.lcm.messages import draw_id
 
 
 class Controller:
-    def __init__(self, arm_name: str, echo: bool, url: str) -> None:
-        self.arm, self.echo = load_arm(arm_name), echo
+    def __init__(self, arm_name: str, url: str) -> None:
+        self.arm = load_arm(arm_name)
         self.kp, self.kd = np.array(self.arm.gains.kp), np.array(self.arm.gains.kd)
         self.sender_id, self.sequence = draw_id(), 0
         self.held = None
@@ -35,15 +35,13 @@ class Controller:
         self.sequence += 1
         effort = effort + self.kp * (q_held - q) - self.kd * v
         command = effort_command(status, effort, self.sender_id, self.sequence)
-        if self.echo:
-            command.control_mode = lcmt_dvrk_command.HOLD
         self.lcm.publish(f"DVRK_COMMAND_{self.arm.name}", command.encode())
 
 
 def main(arguments: list[str]) -> None:
     make_realtime()  # before LCM starts its reading thread
     url = arguments[arguments.index("--lcm-url") + 1] if "--lcm-url" in arguments else ""
-    controller = Controller(arguments[0], "--echo" in arguments, url)
+    controller = Controller(arguments[0], url)
     while True:
         controller.lcm.handle()
 

@@ -110,23 +110,6 @@ def reset(name, observer):
     wait_until(is_cleared, "cleared fault")
 
 
-def test_command_and_status_round_trip(arm):
-    name, _, observer = arm
-    controller = start_controller(name, "--echo")
-    try:
-        before = observer.last.num_accepted
-        first = observer.until(lambda status: status.num_accepted > before, "first command")
-        last = observer.until(lambda status: status.num_accepted > before + 500, "500 commands")
-    finally:
-        controller.end()
-    received = observer.received[first : last + 1]
-    check_clock(received)
-    assert all(map(is_holding, received))
-    assert received[-1].num_refused == received[0].num_refused
-    assert received[-1].command_sequence > 500
-    assert drift(*received) < 1e-4
-
-
 @pytest.mark.watchdog
 @pytest.mark.parametrize("name", ["mtml", pytest.param("psm", marks=pytest.mark.slow)])
 def test_arm_holds_after_controller_is_killed(name, tmp_path):
@@ -210,34 +193,6 @@ def test_arm_holds_after_stall_until_operator_resumes(stalled, seconds):
 
 
 @pytest.mark.watchdog
-@pytest.mark.parametrize("stalled", ["arm", pytest.param("run", marks=pytest.mark.slow)])
-def test_run_ends_after_stall_and_operator_restarts(stalled):
-    observer, url = Observer("mtml", OTHER_URL), ("--lcm-url", OTHER_URL)
-    arm, run = start_arm("mtml", *url), start_run("mtml", *url)
-    runs = [run]
-    try:
-        begun = observer.until(accepts_efforts, "run", process=run)
-        stop(arm if stalled == "arm" else run, 0.2)
-        held = observer.until(waits_for_an_operator, "hold", begun, arm)
-        assert run.wait() == 2
-        runs.append(start_run("mtml", *url))
-        assert runs[-1].wait() == 2
-        for ended in runs:
-            lines = [line for line in ended.output().splitlines() if line.startswith("dvrk-drake: error")]
-            (line,) = lines
-            assert line.startswith("dvrk-drake: error: the guard of MTML holds the arm: ")
-            assert line.endswith("Look at the arm, then start again, over LCM with --reset")
-        assert all(map(waits_for_an_operator, observer.received[held:]))
-        runs.append(start_run("mtml", *url, "--reset"))
-        observer.until(lambda status: is_holding(status) and not status.fault_text, "resume", held, runs[-1])
-        observer.until(accepts_efforts, "run", held, runs[-1])
-    finally:
-        for process in (*runs, arm):
-            print(process.end(signal.SIGINT))
-    assert "the guard of MTML held the arm, and the operator resumes now: " in runs[-1].output()
-
-
-@pytest.mark.watchdog
 @pytest.mark.parametrize("mode", ["gravity", "hold"])
 def test_run_starts_ramps_and_ends_in_hold(arm, mode):
     """A watchdog test, since `control` ends if the computer stops the arm's guard for 0.5 s (`PATIENT`)."""
@@ -262,44 +217,6 @@ def test_run_starts_ramps_and_ends_in_hold(arm, mode):
     assert "holds its pose" in said
     assert "effort; " in said and " Hz, round trip " in said
     print(f"{name} {mode}: {said.splitlines()[-2].strip()}")
-
-
-def test_run_stops_on_fault_and_refuses_faulty_arm():
-    arm = ScriptedArm(OTHER_URL)
-
-    def ends(*options):
-        process = start_run("mtml", "--realtime", "--lcm-url", OTHER_URL, *options)
-        try:
-            yield process
-            arm.say_until(lambda: process.poll() is not None, "end of run")
-            assert process.wait() == 2
-        finally:
-            process.end()
-        yield process.output()
-
-    run = ends()
-    process = next(run)
-    arm.say_until(lambda: arm.commands, "first command", process)
-    arm.status.guard_state, arm.status.accepted_modes = Status.STATE_FAULT, 0b10
-    arm.status.fault_code, arm.status.fault_text = Status.FAULT_DRIVER, "the amplifier is hot"
-    assert "MTML has a fault: the amplifier is hot" in next(run)
-    again = ends()
-    next(again)
-    assert "Look at the arm, then start again, over LCM with --reset" in next(again)
-    arm.commands.clear()
-    meant = start_run("mtml", "--reset", "--realtime", "--lcm-url", OTHER_URL)
-    try:
-        arm.say_until(lambda: any(command.reset_fault for command in arm.commands), "reset", meant)
-        arm.status.guard_state, arm.status.accepted_modes = Status.STATE_HOLD, 0b1110
-        arm.status.fault_code, arm.status.fault_text = Status.FAULT_NONE, ""
-        count = len(arm.commands)
-        arm.say_until(lambda: arm.commands[count:] and arm.commands[-1].control_mode == Command.EFFORT, "run", meant)
-        meant.send_signal(signal.SIGINT)
-        arm.say_until(lambda: meant.poll() is not None, "end of run")
-    finally:
-        said = meant.end()
-    assert meant.wait() == 0, said
-    assert "MTML has a fault, which is reset now: the amplifier is hot" in said
 
 
 @pytest.mark.parametrize("count", [3_000, pytest.param(10_000, marks=pytest.mark.slow)])

@@ -135,31 +135,6 @@ def test_log_and_recording_of_live_arm_agree(tmp_path):
         assert recording.motion(ARM) == ""
 
 
-def test_record_reads_log_from_lcm_logplayer(tmp_path, played):
-    paths = [tmp_path / name for name in ("again.csv", "again.log", "logger.log")]
-    logger, recorders = start_logger(paths[2]), start_records(paths[:2])
-    play(played, "--speed=0.25")  # slowly: nothing is lost on a busy computer either
-    wait_for(max(by_utime(played)), *paths[:2])
-    for recorder in recorders:
-        said = recorder.end(signal.SIGINT)
-        assert recorder.wait() == 0, said
-    end_logger(logger, paths[2])
-    original = read_recording(played, ARM)
-    for path in paths:
-        recording = read_recording(path, ARM)
-        # Nothing is lost on a loopback unless the machine is overloaded; then the rows that came are still right.
-        assert len(recording) >= 0.95 * len(original)
-        rows = np.searchsorted(original.t, recording.t + 1e-3 * missing_at_first(path) - 1e-6)
-        for name in ("q", "qd", "tau"):
-            np.testing.assert_array_equal(getattr(recording, name), getattr(original, name)[rows])
-        if len(recording) == len(original):
-            np.testing.assert_allclose(recording.t, original.t, atol=1e-9)
-
-
-def missing_at_first(path):
-    return (min(by_utime(path)) - statuses(1)[0].utime) // 1000
-
-
 def test_killed_record_or_logger_leaves_readable_file(tmp_path, played):
     """Kills the process when the first file has a given number of 1000 rows."""
     original = by_utime(played)

@@ -98,12 +98,6 @@ def test_detects_all_efforts_inverted_or_in_reverse_order():
         assert found.severity == "refusal" and what in found.what
 
 
-def test_detects_exchanged_efforts_in_joint_coordinates():
-    arm = load_arm("mtmr")
-    damaged = exchanged(motion("mtmr").in_joint_coordinates(arm), 1, 3, "tau")
-    assert [(f.kind, f.joints) for f in check_channels(Observations(damaged, arm))] == [("exchanged channels", (1, 3))]
-
-
 @pytest.mark.parametrize(("name", "joint", "factor"), [("mtmr", 6, 0.5), ("psm", 3, 2.0)])
 def test_detects_a_scaled_effort(name, joint, factor):
     recording = motion(name)
@@ -174,17 +168,6 @@ def test_notes_a_scale_that_friction_cannot_exclude():
     halved = 0.5 * (recording.tau + 0.5 * np.outer(shapes, h)) * (h != 0) + recording.tau * (h == 0)
     found = check_channels(Observations(replace(recording, tau=halved), arm))
     assert [f.severity for f in found if 6 in f.joints and "scale" in f.kind] == ["note"]
-
-
-@pytest.mark.parametrize("name", ["mtm_2015_good72", "mtm_2015_apr18_all80", "mtmr_2017_sweep40"])
-def test_detects_exchanged_efforts_in_real_poses(shared_data, name):
-    path = shared_data / "mtm_static" / f"{name}.csv"
-    if not path.is_file():
-        pytest.skip(f"needs {path}")
-    arm, poses = load_arm("mtmr"), read_recording(path)
-    assert check_channels(Observations(poses, arm)) == []
-    for pair in [(0, 1), (3, 4)]:
-        assert [f.joints for f in check_channels(Observations(exchanged(poses, *pair, "tau"), arm))] == [pair]
 
 
 def test_notes_joints_with_undetectable_offset():

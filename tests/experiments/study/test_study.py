@@ -162,14 +162,6 @@ def test_truncated_table_is_completed_identically(reference, tmp_path):
         assert path.read_bytes() == reference
 
 
-def test_finished_study_runs_nothing(reference, tmp_path):
-    path = tmp_path / "done.csv"
-    path.write_bytes(reference)
-    with WorkerLossExecutor(0) as executor:
-        run_study(make_study(), executor, path)
-    assert path.read_bytes() == reference
-
-
 @pytest.mark.parametrize(
     "change",
     [

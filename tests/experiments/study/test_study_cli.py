@@ -6,7 +6,6 @@ import sys
 import numpy as np
 import pytest
 from command_output import refusal, refused
-from repository import ROOT
 
 from dvrk_drake.cli import main
 from dvrk_drake.experiments.study.study_file import load_study
@@ -90,11 +89,6 @@ def test_rejects_invalid_schedulers(study, capsys):
     command = [sys.executable, "-c", code, "simulate", "study", study, *options]
     done = subprocess.run(command, check=False, capture_output=True, text=True)
     assert done.returncode == 2 and "no Dask scheduler answers at this address" in refusal(done.stderr)
-
-
-def test_example_is_valid_study():
-    study = load_study(ROOT / "examples" / "release_study.yaml")
-    assert len(study.cases) == 60
 
 
 def test_command_line_settings_override_file(study):

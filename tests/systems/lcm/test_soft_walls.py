@@ -106,10 +106,3 @@ def test_wrist_on_soft_wall_comes_to_rest(name, joint):
     effort = np.array([status.effort_commanded[joint] for status in last])
     assert np.abs(np.diff(effort)).max() < 0.01 * arm.arm.effort_limits[joint]
     assert np.abs([status.velocity[joint] for status in last]).max() < 0.1
-
-
-@pytest.mark.parametrize("name", ARMS)
-def test_unpowered_arm_falls_into_soft_wall(name):
-    worst, status = pushed(name, np.zeros(7), 2.0)
-    assert worst < 0.5
-    assert status.guard_state == Status.STATE_EFFORT
