@@ -85,13 +85,6 @@ def has_status(path):
     return path.exists() and path.read_bytes().count(b"DVRK_STATUS_MTML") > 1
 
 
-def wait_for(mark, *paths):
-    """Waits until the last message is in the files: a channel, or the utime of a status."""
-    marks = {".csv": str(mark).encode()}
-    binary = mark.encode() if isinstance(mark, str) else mark.to_bytes(8, "big")
-    wait_until(lambda: all(marks.get(path.suffix, binary) in path.read_bytes() for path in paths), f"{mark} in {paths}")
-
-
 def end_logger(logger, path):
     """Stops a process when it has written all earlier messages."""
     publisher = lcm.LCM()

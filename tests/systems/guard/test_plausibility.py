@@ -24,13 +24,6 @@ TOLERANCE = SETTINGS.position_tolerance + 3 * COUNTS
 JOINTS = range(N)
 
 
-class Unity(Weightless):
-    """Model with unit inertia in all joints."""
-
-    def mass_matrix(self, q):
-        return np.eye(len(q))
-
-
 class Sensors:
     """Arm with a prescribed motion, and the checks of its measurements."""
 
