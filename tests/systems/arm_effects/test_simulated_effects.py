@@ -8,13 +8,15 @@ from arm_copies import copy_arm
 from command_output import assert_refused
 from simulated_effects import ARMS
 
+from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.kinematics import ArmFrame
 from dvrk_drake.errors import ArmError, ScenarioError, StationError
 from dvrk_drake.experiments.scenario import HandScenario, load_scenario
 from dvrk_drake.experiments.simulation import simulate
-from dvrk_drake.models.arm_files import load_arm
+from dvrk_drake.models.arm_files import known_arms, load_arm
 from dvrk_drake.models.effects_schema import EFFECT_NAMES, ArmEffects, FrictionEffect
 from dvrk_drake.models.sdf_model import MODELS_FOLDER
+from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.systems.arm_station import ArmStation
 
 pytestmark = [pytest.mark.numeric, pytest.mark.drake_api]
@@ -23,6 +25,41 @@ pytestmark = [pytest.mark.numeric, pytest.mark.drake_api]
 def scenario(arm, *settings):
     parts = ["duration=0.3", "simulated_effects=[all]", "sample_period=0.001"]
     return load_scenario(arm, [*parts, *settings])
+
+
+def holding_efforts(arm, q):
+    """Returns the holding efforts (m, n) of the SDF, and those with the springs and cables of the arm file."""
+    models = (IdentifiedModel.from_arm(arm), IdentifiedModel.from_arm(arm, arm.effects.position_dependent))
+    return [np.array([model.holding_torque(pose) for pose in q]) for model in models]
+
+
+@pytest.mark.parametrize("name", known_arms())
+def test_motors_can_hold_the_arm_against_its_springs_and_cables(name):
+    arm = load_arm(name)
+    for efforts in holding_efforts(arm, arm.sample_poses(200, np.random.default_rng(0))):
+        assert np.all(np.abs(efforts) + arm.dry_friction() < arm.effort_limits)
+
+
+@pytest.mark.parametrize(
+    ("name", "coordinates", "files"),
+    [
+        ("mtmr", "actuator", ["trajectories/mtm_one.csv", "trajectories/mtm_earlier_day.csv"]),
+        ("mtmr", "joint", ["mtm_static/mtm_2015_good72.csv"]),
+        ("mtmr", "joint", ["mtm_static/mtmr_2017_sweep40.csv", "mtm_static/mtmr_2017_coupled12_may10.csv"]),
+        ("psm", "wpi", ["trajectories/psm_one.csv", "trajectories/psm_one_no_weight.csv"]),
+    ],
+)
+def test_springs_and_cables_bring_the_sdf_nearer_to_real_arms(shared_data, name, coordinates, files):
+    """Friction and dynamics are part of the efforts, so the sum over the recordings of an arm is compared."""
+    arm, squares = load_arm(name), np.zeros(2)
+    joints = [j for j, x in enumerate(arm.joint_names) if any(x in e.coordinate for e in arm.effects.position_dependent)]
+    for file in files:
+        recording = read_recording(shared_data / file, arm, coordinates=coordinates)
+        every = slice(None, None, max(1, len(recording.q) // 200))
+        tau = recording.measured_effort()[every]
+        error = [(tau - efforts) / arm.effort_limits for efforts in holding_efforts(arm, recording.q[every])]
+        squares += [np.mean(each[:, joints] ** 2) for each in error]
+    assert squares[1] < squares[0]
 
 
 @pytest.mark.parametrize("name", ["mtml", pytest.param("psm", marks=pytest.mark.slow)])
