@@ -1,6 +1,6 @@
 """Prints what half and twice the value of a constant change, for the reasons beside the constants of `analysis`.
 
-    python benchmarks/thresholds.py FOLDER check.measurement_check.MIN_JITTER ... [--results motions poses payloads design]
+    python benchmarks/thresholds.py FOLDER check.measurement_check.MIN_JITTER ... [--results motions poses ...]
 
 FOLDER contains the folders trajectories, psm_three_joints and mtm_static with the public recordings
 (docs/public_recordings.md). A constant is named by its module in `dvrk_drake.analysis`. The output lists the findings

@@ -52,7 +52,8 @@ def test_motors_can_hold_the_arm_against_its_springs_and_cables(name):
 def test_springs_and_cables_bring_the_sdf_nearer_to_real_arms(shared_data, name, coordinates, files):
     """Friction and dynamics are part of the efforts, so the sum over the recordings of an arm is compared."""
     arm, squares = load_arm(name), np.zeros(2)
-    joints = [j for j, x in enumerate(arm.joint_names) if any(x in e.coordinate for e in arm.effects.position_dependent)]
+    moved = {effect.coordinate.partition(".")[2] for effect in arm.effects.position_dependent}
+    joints = [j for j, joint in enumerate(arm.joint_names) if joint in moved]
     for file in files:
         recording = read_recording(shared_data / file, arm, coordinates=coordinates)
         every = slice(None, None, max(1, len(recording.q) // 200))
