@@ -13,8 +13,8 @@ from pathlib import Path
 
 from timing import print_table
 
-from dvrk_drake.experiments.study.study import run_study_locally
-from dvrk_drake.experiments.study.study_file import load_study
+from dvrk_drake.experiments.study import load_study
+from dvrk_drake.experiments.study_run import run_study_locally
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "release_study.yaml"
 

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from dvrk_drake.recordings.reading import read_recording
     from dvrk_drake.recordings.recording import Recording
     from dvrk_drake.recordings.writing import write_recording, write_samples
-    from dvrk_drake.reports.write import write_report
+    from dvrk_drake.reports.html_file import write_report
     from dvrk_drake.systems.arm_drive import add_arm_drive
     from dvrk_drake.systems.arm_effects.dry_friction import PlantEffects
     from dvrk_drake.systems.arm_station import ArmStation
@@ -107,7 +107,7 @@ _MODULES = {
     "start_meshcat": "systems.arm_view.page",
     "validate": "analysis.validation",
     "write_recording": "recordings.writing",
-    "write_report": "reports.write",
+    "write_report": "reports.html_file",
     "write_samples": "recordings.writing",
 }
 

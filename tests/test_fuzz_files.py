@@ -29,10 +29,10 @@ from dvrk_drake.analysis.excitation.pose_file import CollectionFile, load_poses,
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import DvrkDrakeError
-from dvrk_drake.experiments.reproduction.published import PaperRecordings
+from dvrk_drake.experiments.paper import PaperRecordings
 from dvrk_drake.experiments.scenario import load_scenario
-from dvrk_drake.experiments.study.study_file import load_study
-from dvrk_drake.experiments.study.table import Row, StudyTable
+from dvrk_drake.experiments.study import load_study
+from dvrk_drake.experiments.study_table import Row, StudyTable
 from dvrk_drake.export.dvrk_mtm_gravity_compensation import CompensationOptions, compensation_from_model
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
 from dvrk_drake.export.dvrk_psm_gravity_compensation import kinematic_compensation
@@ -275,8 +275,8 @@ def test_damaged_file_is_read_or_rejected(name, valid):
 #: Functions that take long or require an arm. Commands call them after reading their files.
 WORK = (
     "dvrk_drake.systems.lcm.lcm_network.usable_lcm_url",
-    "dvrk_drake.experiments.tuning.tuning.tune_arm",
-    "dvrk_drake.experiments.study.study.run_study_locally",
+    "dvrk_drake.experiments.tuning.tune_arm",
+    "dvrk_drake.experiments.study_run.run_study_locally",
     "dvrk_drake.experiments.transparency.simulate_operator",
     "dvrk_drake.analysis.identification.identify_dynamic",
     "dvrk_drake.analysis.payload.estimate_payload",

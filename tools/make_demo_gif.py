@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from playwright.sync_api import sync_playwright
 
-from dvrk_drake.experiments.demo.demo import RELEASE_TIME
+from dvrk_drake.experiments.demo import RELEASE_TIME
 
 FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-gpu")
 #: Hides the control panel of Meshcat, and the captions, which are too small for a GIF. `label` writes larger ones.

@@ -20,8 +20,7 @@ from pydrake.geometry import Meshcat, Role
 
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.systems.arm_view.arm_view import ArmView
-from dvrk_drake.systems.arm_view.camera import ZOOM, framing
-from dvrk_drake.systems.arm_view.page import start_meshcat
+from dvrk_drake.systems.arm_view.page import ZOOM, framing, start_meshcat
 
 CHROMIUM_FLAGS = (
     "--headless",

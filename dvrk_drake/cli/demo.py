@@ -27,7 +27,7 @@ def demo(
     Args:
         arm: Arm to simulate.
     """
-    from dvrk_drake.experiments.demo.demo import run_demo
+    from dvrk_drake.experiments.demo import run_demo
     from dvrk_drake.reports.demo import write_demo
 
     output = support.new_folder(folder, overwrite=overwrite)
@@ -56,8 +56,7 @@ def teleop(
         output: Play a recorded hand motion, write an animation to this HTML file, and print the PSM's tracking error.
         force_feedback: Place an object below the instrument, and reflect the estimated force of the contact to the MTM.
     """
-    from dvrk_drake.experiments.demo.teleoperation import PHASES, play_teleoperation, run_live_teleoperation
-    from dvrk_drake.experiments.demo.teleoperation_scene import start_scene
+    from dvrk_drake.experiments.teleoperation import PHASES, play_teleoperation, run_live_teleoperation, start_scene
     from dvrk_drake.models.files import atomic_write
     from dvrk_drake.reports.demo import teleoperation_page
     from dvrk_drake.systems.arm_view.efforts import FORCE_COLOR, FORCE_SCALE
@@ -103,9 +102,9 @@ def reproduce(
         what: Table, figure or experiment to reproduce.
         data: Folder with mtm_2015_good72.csv (docs/public_recordings.md). Default: $DVRK_DRAKE_SHARED/data/mtm_static.
     """
-    from dvrk_drake.experiments.reproduction.published import PaperRecordings
-    from dvrk_drake.reports.reproduction.page import NAMES
-    from dvrk_drake.reports.reproduction.page import reproduce as reproduce_paper
+    from dvrk_drake.experiments.paper import PaperRecordings
+    from dvrk_drake.reports.reproduction import NAMES
+    from dvrk_drake.reports.reproduction import reproduce as reproduce_paper
     from dvrk_drake.reports.terminal import make_console
 
     recordings = PaperRecordings.find(data)

@@ -32,7 +32,7 @@ def equations(
     from dvrk_drake.dynamics.symbolic_gravity import SymbolicPlant, derive_gravity
     from dvrk_drake.export import gravity_sources
     from dvrk_drake.models.files import atomic_write
-    from dvrk_drake.reports.model import symbolic_model_page
+    from dvrk_drake.reports.parameters import symbolic_model_page
 
     if output is not None:
         if format is None:

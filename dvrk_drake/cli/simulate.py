@@ -102,8 +102,8 @@ def study(
         workers: Number of processes on this computer, 1 to 1024. Default: one per core.
         scheduler: Address of a Dask cluster that runs the study, e.g. tcp://host:8786.
     """
-    from dvrk_drake.experiments.study.study import dask_executor, run_study, run_study_locally
-    from dvrk_drake.experiments.study.study_file import load_study
+    from dvrk_drake.experiments.study import load_study
+    from dvrk_drake.experiments.study_run import dask_executor, run_study, run_study_locally
     from dvrk_drake.reports.study import study_page
 
     loaded = load_study(study, set or [])
@@ -147,7 +147,7 @@ def tune(
     Args:
         output: File for the gains. With method both, the better gains are written.
     """
-    from dvrk_drake.experiments.tuning.tuning import Method, tune_arm
+    from dvrk_drake.experiments.tuning import Method, tune_arm
     from dvrk_drake.models.arm_schema import save_gains
     from dvrk_drake.reports.tuning import tuning_page
 

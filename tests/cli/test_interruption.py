@@ -21,13 +21,13 @@ COMMANDS = {
     ),
     "simulate study": (
         ["study.yaml", "--output", "o.csv", "--plots", "new/p"],
-        "experiments.study.study.run_study_locally",
+        "experiments.study_run.run_study_locally",
     ),
     "simulate tune": (
         ["--arm", "mtml", "--output", "o.yaml", "--plots", "new/p"],
-        "experiments.tuning.tuning.tune_arm",
+        "experiments.tuning.tune_arm",
     ),
-    "reproduce": (["fig7", "--folder", "new/p"], "reports.reproduction.page.reproduce"),
+    "reproduce": (["fig7", "--folder", "new/p"], "reports.reproduction.reproduce"),
 }
 
 

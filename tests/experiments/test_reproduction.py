@@ -16,36 +16,38 @@ from dvrk_drake.cli.demo import reproduce as command
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import DvrkDrakeError, RecordingError
 from dvrk_drake.experiments.ground_truth import perturbed_arm
-from dvrk_drake.experiments.releases import BAND, SAMPLE_PERIOD, Drifts, release, release_all
-from dvrk_drake.experiments.reproduction.mechanisms import mechanism_errors, recomputed_table
-from dvrk_drake.experiments.reproduction.published import (
+from dvrk_drake.experiments.paper import (
     PAPER,
+    IdentifiedArm,
     PaperRecordings,
+    ReproductionSession,
+    SampleSizes,
     paper_model,
     paper_torque,
     with_zero_torque,
 )
-from dvrk_drake.experiments.reproduction.session import IdentifiedArm, ReproductionSession, SampleSizes
-from dvrk_drake.experiments.reproduction.step_response import (
+from dvrk_drake.experiments.paper_experiments import (
     PERIOD,
     longest_period,
+    mechanism_errors,
     oscillation_modes,
     paper_simulated_arm,
+    recomputed_table,
     simulate_paper_controller,
 )
+from dvrk_drake.experiments.releases import BAND, SAMPLE_PERIOD, Drifts, release, release_all
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_selector
 from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import Recording
-from dvrk_drake.reports.colours import MEASURED
+from dvrk_drake.reports import reproduction as reproduction_page
+from dvrk_drake.reports import reproduction_drift as drift
 from dvrk_drake.reports.image_files import write_images
 from dvrk_drake.reports.page import Page, Plot, Section, Table, Text
-from dvrk_drake.reports.plot import Curve, Panel
-from dvrk_drake.reports.reproduction import drift
-from dvrk_drake.reports.reproduction import page as reproduction_page
-from dvrk_drake.reports.reproduction.drift import reproduce_figure_5, share
-from dvrk_drake.reports.reproduction.figures import reproduce_transparency
-from dvrk_drake.reports.reproduction.page import NAMES, reproduce, write_page
+from dvrk_drake.reports.plot import MEASURED, Curve, Panel
+from dvrk_drake.reports.reproduction import NAMES, reproduce, write_page
+from dvrk_drake.reports.reproduction_drift import reproduce_figure_5, share
+from dvrk_drake.reports.reproduction_figures import reproduce_transparency
 
 ARM = load_arm(PAPER.arm)
 

@@ -12,25 +12,7 @@ from scipy.optimize import brentq
 
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.experiments.scenario import load_scenario
-from dvrk_drake.experiments.tuning.bench import Bench, JointOnBench, Response, band, step_size
-from dvrk_drake.experiments.tuning.model_based import (
-    GAIN_MARGIN,
-    MAX_COUNT_EFFORT,
-    PHASE_MARGIN,
-    JointProperties,
-    design_arm,
-    design_joint,
-    mass_matrices,
-    sampling_of,
-)
-from dvrk_drake.experiments.tuning.procedure import (
-    RELEASE_DURATION,
-    evaluate_oscillation,
-    find_ultimate_gain,
-    tune_joint,
-)
-from dvrk_drake.experiments.tuning.sampled_loop import SampledLoop, Sampling, place
-from dvrk_drake.experiments.tuning.tuning import (
+from dvrk_drake.experiments.tuning import (
     CONDITIONS,
     DURATION,
     REST_TIME,
@@ -38,6 +20,26 @@ from dvrk_drake.experiments.tuning.tuning import (
     StepMeasures,
     measure_step,
     tune_arm,
+)
+from dvrk_drake.experiments.tuning_bench import Bench, JointOnBench, Response, band, step_size
+from dvrk_drake.experiments.tuning_model_based import (
+    GAIN_MARGIN,
+    MAX_COUNT_EFFORT,
+    PHASE_MARGIN,
+    JointProperties,
+    SampledLoop,
+    Sampling,
+    design_arm,
+    design_joint,
+    mass_matrices,
+    place,
+    sampling_of,
+)
+from dvrk_drake.experiments.tuning_procedure import (
+    RELEASE_DURATION,
+    evaluate_oscillation,
+    find_ultimate_gain,
+    tune_joint,
 )
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.arm_schema import Gains, load_gains, save_gains
@@ -324,7 +326,7 @@ def test_psm_insertion_ultimate_gain_matches_analytic():
 
 @pytest.mark.slow
 def test_designed_gains_settle_all_psm_joints(tmp_path, monkeypatch):
-    monkeypatch.setattr("dvrk_drake.experiments.tuning.tuning.local_executor", partial(local_executor, 1))
+    monkeypatch.setattr("dvrk_drake.experiments.tuning.local_executor", partial(local_executor, 1))
     tuning = tune_arm("psm", ["model"], conditions=CONDITIONS[:1], poses=1)
     settling = tuning.comparison.table("model", "settling")
     assert np.all(np.isfinite(settling))

@@ -16,7 +16,7 @@ from dvrk_drake.analysis.excitation.pose_file import CollectionFile, load_poses
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ArmError, DvrkDrakeError, ModelError, RecordingError
 from dvrk_drake.experiments.scenario import load_scenario
-from dvrk_drake.experiments.study.study_file import load_study
+from dvrk_drake.experiments.study import load_study
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.arm_schema import load_gains

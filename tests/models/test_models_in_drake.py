@@ -17,7 +17,7 @@ from dvrk_drake.analysis.validation import validate_static
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ModelError
-from dvrk_drake.experiments.reproduction.published import PAPER
+from dvrk_drake.experiments.paper import PAPER
 from dvrk_drake.export.dvrk_mtm_gravity_compensation import CompensationOptions, compensation_from_model
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile, controller_torque

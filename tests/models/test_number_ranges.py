@@ -19,7 +19,7 @@ from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, ModelFile
 from dvrk_drake.errors import ArmError, ControllerError, ScenarioError
 from dvrk_drake.experiments.scenario import Scenario, load_scenario
-from dvrk_drake.experiments.study.study_file import Study
+from dvrk_drake.experiments.study import Study
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm

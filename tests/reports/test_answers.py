@@ -17,13 +17,13 @@ from report_results import operator_forces, study_results, tuning_result
 import dvrk_drake as dvrk
 from dvrk_drake.cli.program import app
 from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
-from dvrk_drake.experiments.demo.demo import DemoResult
-from dvrk_drake.experiments.demo.teleoperation import TeleoperationResult
+from dvrk_drake.experiments.demo import DemoResult
+from dvrk_drake.experiments.teleoperation import TeleoperationResult
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
 from dvrk_drake.reports import demo, export, recording_check, simulation, terminal
 from dvrk_drake.reports.identification import identification_page, recalibration_page
-from dvrk_drake.reports.model import symbolic_model_page
+from dvrk_drake.reports.parameters import symbolic_model_page
 from dvrk_drake.reports.payload import payload_page
 from dvrk_drake.reports.study import study_page
 from dvrk_drake.reports.terminal import TABLE_WIDTH, TableConsole

@@ -14,13 +14,13 @@ from dvrk_drake.analysis.validation import baseline_efforts
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.models.effects_schema import half_width
 from dvrk_drake.reports.efforts import MAX_ROWS, bin_means, budget_of, budget_plot, efforts_of, efforts_plot
+from dvrk_drake.reports.html_file import write_report
 from dvrk_drake.reports.identification import identification_page
 from dvrk_drake.reports.image_files import write_images
 from dvrk_drake.reports.page import Plot, Scene, Table
 from dvrk_drake.reports.parameters import estimate_cells, interval, parameter_blocks
 from dvrk_drake.reports.playback import MAX_FRAMES, MAX_RATE, frame_times
 from dvrk_drake.reports.plot import Bars, Curve, axis_range, decimated
-from dvrk_drake.reports.write import write_report
 
 SAMPLES = files("dvrk_drake") / "samples"
 TITLES = [

@@ -5,7 +5,7 @@ import sys
 
 
 def test_reports_import_no_simulation_and_no_plots():
-    modules = ("identification", "payload", "recording_check", "export", "model")
+    modules = ("identification", "payload", "recording_check", "export", "parameters")
     statement = f"import sys; from dvrk_drake.reports import {', '.join(modules)}; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", statement], capture_output=True, text=True, check=True)
     loaded = done.stdout.split()

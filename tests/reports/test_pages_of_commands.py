@@ -22,7 +22,7 @@ from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensa
 from dvrk_drake.models.files import Reportable
 from dvrk_drake.reports.excitation import motion_page, poses_page
 from dvrk_drake.reports.export import compensation_page
-from dvrk_drake.reports.html_file import render_html, write_html
+from dvrk_drake.reports.html_file import _MAKERS, render_html, write_html
 from dvrk_drake.reports.image_files import write_images
 from dvrk_drake.reports.page import Plot, Table
 from dvrk_drake.reports.payload import payload_page
@@ -30,7 +30,6 @@ from dvrk_drake.reports.plot import Curve, Guide
 from dvrk_drake.reports.study import study_page
 from dvrk_drake.reports.transparency import transparency_page
 from dvrk_drake.reports.tuning import tuning_page
-from dvrk_drake.reports.write import _MAKERS
 
 
 @cache

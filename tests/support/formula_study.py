@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-import dvrk_drake.experiments.study.study as study_module
+import dvrk_drake.experiments.study_run as study_module
 from dvrk_drake.experiments.simulation import Simulation
 from dvrk_drake.recordings.recording import Recording
 

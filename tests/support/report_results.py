@@ -3,15 +3,14 @@
 import numpy as np
 
 import dvrk_drake as dvrk
-from dvrk_drake.experiments.study.measures import Measure
-from dvrk_drake.experiments.study.study_file import RandomPoses, Study, Variation
-from dvrk_drake.experiments.study.table import Row
+from dvrk_drake.experiments.study import RandomPoses, Study, Variation
+from dvrk_drake.experiments.study_measures import Measure
+from dvrk_drake.experiments.study_table import Row
 from dvrk_drake.experiments.transparency import OperatorForces
-from dvrk_drake.experiments.tuning.bench import Response, step_size
-from dvrk_drake.experiments.tuning.model_based import ArmDesign, JointDesign, JointProperties
-from dvrk_drake.experiments.tuning.procedure import JointProcedure, Ultimate
-from dvrk_drake.experiments.tuning.sampled_loop import Margins
-from dvrk_drake.experiments.tuning.tuning import CONDITIONS, OWN, PUBLISHED, Comparison, StepMeasures, Tuning
+from dvrk_drake.experiments.tuning import CONDITIONS, OWN, PUBLISHED, Comparison, StepMeasures, Tuning
+from dvrk_drake.experiments.tuning_bench import Response, step_size
+from dvrk_drake.experiments.tuning_model_based import ArmDesign, JointDesign, JointProperties, Margins
+from dvrk_drake.experiments.tuning_procedure import JointProcedure, Ultimate
 
 
 def study_results():

@@ -8,7 +8,7 @@ from controlled_arm import ControlledArm
 from pydrake.systems.primitives import ConstantVectorSource
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.experiments.reproduction.published import PAPER
+from dvrk_drake.experiments.paper import PAPER
 from dvrk_drake.models.arm_files import load_arm
 
 ARM = load_arm("mtml")

@@ -10,7 +10,7 @@ from pydrake.trajectories import PiecewisePose
 from robot_file import write_robot
 
 from dvrk_drake.errors import ControllerError
-from dvrk_drake.experiments.demo.teleoperation import SCALE, START_FOLLOWER, START_MASTER
+from dvrk_drake.experiments.teleoperation import SCALE, START_FOLLOWER, START_MASTER
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
 from dvrk_drake.systems.hand import PoseTrajectorySource

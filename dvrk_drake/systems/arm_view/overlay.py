@@ -14,10 +14,9 @@ from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import set_arm_positions, shared_plant
 from dvrk_drake.systems.arm_station import ArmStation
-from dvrk_drake.systems.arm_view.camera import geometry_corners, home_position
-from dvrk_drake.systems.arm_view.controls import PanelText
 from dvrk_drake.systems.arm_view.drawn_arm import COMMANDED, GhostArm, Visibility
 from dvrk_drake.systems.arm_view.efforts import FORCE_SCALE, DrawnForce, EffortArcs, ForceArrow, axis_frames
+from dvrk_drake.systems.arm_view.page import geometry_corners, home_position
 
 DESIRED = "desired"
 #: Meaning of the colours of the efforts, for the control panel, which is 40 characters wide.
@@ -34,6 +33,27 @@ TRACE_JUMP = 0.1
 TRACE_STEP, TRACE_POINTS = 5e-4, 2000
 #: Period in which the overlay of a simulated arm is drawn [s].
 PERIOD = 1 / 32
+
+
+class PanelText:
+    """Row of the control panel with a text that changes.
+
+    It is a button without effect, because the panel has no texts. Meshcat adds it below the existing rows.
+    """
+
+    def __init__(self, meshcat: Meshcat) -> None:
+        """Starts without a text."""
+        self._meshcat, self._text = meshcat, ""
+
+    def show(self, text: str) -> None:
+        """Replaces the text. "" removes the row."""
+        if text == self._text:
+            return
+        if self._text:
+            self._meshcat.DeleteButton(self._text, strict=False)
+        if text:
+            self._meshcat.AddButton(text)
+        self._text = text
 
 
 class ArmOverlay:

@@ -19,11 +19,18 @@ from dvrk_drake.models.plant import set_arm_positions, shared_plant
 from dvrk_drake.processes.live_view import LiveForce, show_status
 from dvrk_drake.systems.arm_view import page
 from dvrk_drake.systems.arm_view.arm_view import DEGREES, FRAMES, ArmView
-from dvrk_drake.systems.arm_view.camera import ASPECT, HALF_HEIGHT, REPORT_ASPECT, corners_at, framing, geometry_corners
 from dvrk_drake.systems.arm_view.drawn_arm import Visibility
 from dvrk_drake.systems.arm_view.efforts import LEVELS, axis_frames
 from dvrk_drake.systems.arm_view.overlay import ArmOverlay
-from dvrk_drake.systems.arm_view.page import start_meshcat
+from dvrk_drake.systems.arm_view.page import (
+    ASPECT,
+    HALF_HEIGHT,
+    REPORT_ASPECT,
+    corners_at,
+    framing,
+    geometry_corners,
+    start_meshcat,
+)
 
 pytestmark = pytest.mark.drake_api
 

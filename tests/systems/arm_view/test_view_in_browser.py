@@ -8,8 +8,7 @@ from waiting import wait_until
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import set_arm_positions, shared_plant
 from dvrk_drake.systems.arm_view.arm_view import DEGREES, EFFORTS, FRAMES, HOME, RANDOM, ArmView
-from dvrk_drake.systems.arm_view.camera import home_position
-from dvrk_drake.systems.arm_view.page import start_meshcat
+from dvrk_drake.systems.arm_view.page import home_position, start_meshcat
 
 
 def open_view(open_page, name):

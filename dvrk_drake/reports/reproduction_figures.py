@@ -12,26 +12,38 @@ import dvrk_drake as dvrk
 from dvrk_drake.analysis.pose_identification import StaticIdentification, identify_static
 from dvrk_drake.dynamics.friction_compensation import MAX_RATIO, Friction
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.experiments.reproduction.mechanisms import TABLE_POSES, recomputed_table
-from dvrk_drake.experiments.reproduction.published import PAPER
-from dvrk_drake.experiments.reproduction.session import ReproductionSession
-from dvrk_drake.experiments.reproduction.step_response import (
+from dvrk_drake.experiments.paper import PAPER, ReproductionSession
+from dvrk_drake.experiments.paper_experiments import (
     DURATION,
     OUR_DURATION,
     PERIOD,
+    TABLE_POSES,
     longest_period,
     oscillation_modes,
     paper_simulated_arm,
+    recomputed_table,
     simulate_ours,
     simulate_paper_controller,
 )
 from dvrk_drake.experiments.transparency import Compensation, OperatorForces, random_path, simulate_operator
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.progress import step_progress
-from dvrk_drake.reports.colours import COMMANDED, HELD_OUT, LIMIT, MEASURED, REFERENCE, SERIES
 from dvrk_drake.reports.page import Block, Plot, Section, Table, Text
-from dvrk_drake.reports.plot import Curve, Guide, Mark, Panel, Style, joint_label
-from dvrk_drake.reports.reproduction.drift import JOINTS, numbers
+from dvrk_drake.reports.plot import (
+    COMMANDED,
+    HELD_OUT,
+    LIMIT,
+    MEASURED,
+    REFERENCE,
+    SERIES,
+    Curve,
+    Guide,
+    Mark,
+    Panel,
+    Style,
+    joint_label,
+)
+from dvrk_drake.reports.reproduction_drift import JOINTS, numbers
 from dvrk_drake.reports.transparency import forces_plot, forces_table
 from dvrk_drake.workers import await_results
 

@@ -15,9 +15,9 @@ import pytest
 from command_output import messages
 from waiting import TIMEOUT, wait_until
 
-import dvrk_drake.experiments.study.study as study_module
-from dvrk_drake.experiments.study.study import run_study
-from dvrk_drake.experiments.study.study_file import load_study
+import dvrk_drake.experiments.study_run as study_module
+from dvrk_drake.experiments.study import load_study
+from dvrk_drake.experiments.study_run import run_study
 
 pytestmark = pytest.mark.slow
 

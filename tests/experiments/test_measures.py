@@ -9,7 +9,7 @@ from command_output import assert_refused
 from dvrk_drake.errors import StudyError
 from dvrk_drake.experiments.scenario import Scenario, Target
 from dvrk_drake.experiments.simulation import Simulation
-from dvrk_drake.experiments.study.measures import KINDS, Measure
+from dvrk_drake.experiments.study_measures import KINDS, Measure
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.recording import Recording
 

@@ -10,18 +10,27 @@ from numpy.typing import ArrayLike, NDArray
 
 from dvrk_drake.dynamics.friction_compensation import MAX_HYSTERESIS_RATIO
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
+from dvrk_drake.experiments.paper import PAPER, ReproductionSession, with_zero_torque
+from dvrk_drake.experiments.paper_experiments import AXIS_POSES, mechanism_errors
 from dvrk_drake.experiments.releases import APPROACH, APPROACH_TIME, APPROACHED_RELEASE, BAND, SAMPLE_PERIOD, Drifts
-from dvrk_drake.experiments.reproduction.mechanisms import AXIS_POSES, mechanism_errors
-from dvrk_drake.experiments.reproduction.published import PAPER, with_zero_torque
-from dvrk_drake.experiments.reproduction.session import ReproductionSession
-from dvrk_drake.experiments.study.table import Share
-from dvrk_drake.experiments.tuning.model_based import friction
+from dvrk_drake.experiments.study_table import Share
+from dvrk_drake.experiments.tuning_model_based import friction
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import EFFECT_NAMES
 from dvrk_drake.models.plant import make_arm_plant
-from dvrk_drake.reports.colours import FITTED, LIMIT, MEASURED, REFERENCE
 from dvrk_drake.reports.page import Block, Plot, Section, Table, Text
-from dvrk_drake.reports.plot import Curve, Guide, Mark, Panel, joint_label, length_unit
+from dvrk_drake.reports.plot import (
+    FITTED,
+    LIMIT,
+    MEASURED,
+    REFERENCE,
+    Curve,
+    Guide,
+    Mark,
+    Panel,
+    joint_label,
+    length_unit,
+)
 
 #: Interval over which a drift rate is averaged, and simulated time after the release of an arm without friction [s].
 RATE_TIME, FRICTIONLESS_DURATION = 1.0, 3.0

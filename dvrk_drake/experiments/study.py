@@ -19,7 +19,7 @@ import numpy as np
 
 from dvrk_drake.errors import DvrkDrakeError, StudyError
 from dvrk_drake.experiments.scenario import Scenario, check_pose, load_scenario
-from dvrk_drake.experiments.study.measures import Measure
+from dvrk_drake.experiments.study_measures import Measure
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.ranges import number_fault, within
 from dvrk_drake.models.sdf_model import compose_sdf

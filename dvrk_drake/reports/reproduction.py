@@ -7,15 +7,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from dvrk_drake.errors import DvrkDrakeError
-from dvrk_drake.experiments.reproduction.published import PaperRecordings
-from dvrk_drake.experiments.reproduction.session import ReproductionSession, SampleSizes
+from dvrk_drake.experiments.paper import PaperRecordings, ReproductionSession, SampleSizes
 from dvrk_drake.models.files import atomic_write
 from dvrk_drake.progress import Progress
 from dvrk_drake.reports.html_file import write_html
 from dvrk_drake.reports.image_files import write_images
 from dvrk_drake.reports.page import Page, Section, Table, Text
-from dvrk_drake.reports.reproduction.drift import reproduce_figure_5, reproduce_figure_6, reproduce_psm
-from dvrk_drake.reports.reproduction.figures import (
+from dvrk_drake.reports.reproduction_drift import reproduce_figure_5, reproduce_figure_6, reproduce_psm
+from dvrk_drake.reports.reproduction_figures import (
     reproduce_figure_4,
     reproduce_figure_7,
     reproduce_table_1,

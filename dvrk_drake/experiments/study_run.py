@@ -15,9 +15,9 @@ import numpy as np
 from dvrk_drake.errors import SimulationError, StudyError
 from dvrk_drake.experiments.scenario import Scenario
 from dvrk_drake.experiments.simulation import simulate
-from dvrk_drake.experiments.study.measures import Measure
-from dvrk_drake.experiments.study.study_file import Case, Study, versions
-from dvrk_drake.experiments.study.table import Row, StudyTable
+from dvrk_drake.experiments.study import Case, Study, versions
+from dvrk_drake.experiments.study_measures import Measure
+from dvrk_drake.experiments.study_table import Row, StudyTable
 from dvrk_drake.workers import local_executor
 
 if TYPE_CHECKING:

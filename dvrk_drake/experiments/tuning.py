@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from dvrk_drake.experiments.tuning.bench import (
+from dvrk_drake.experiments.tuning_bench import (
     NOMINAL,
     Bench,
     Condition,
@@ -22,8 +22,8 @@ from dvrk_drake.experiments.tuning.bench import (
     step_size,
     tuning_poses,
 )
-from dvrk_drake.experiments.tuning.model_based import ArmDesign, design_arm
-from dvrk_drake.experiments.tuning.procedure import JointProcedure, tune_joint
+from dvrk_drake.experiments.tuning_model_based import ArmDesign, design_arm
+from dvrk_drake.experiments.tuning_procedure import JointProcedure, tune_joint
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.arm_schema import Gains

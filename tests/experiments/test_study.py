@@ -11,13 +11,13 @@ from figure_rules import checked_figures
 from report_pages import printed
 from scipy.stats import norm
 
-import dvrk_drake.experiments.study.study as study_module
+import dvrk_drake.experiments.study_run as study_module
 from dvrk_drake.errors import SimulationError, StudyError
 from dvrk_drake.experiments.simulation import Simulation
-from dvrk_drake.experiments.study.measures import Measure
-from dvrk_drake.experiments.study.study import run_study
-from dvrk_drake.experiments.study.study_file import RandomPoses, Study, Variation
-from dvrk_drake.experiments.study.table import Quantiles, Share, StudyTable, summarise
+from dvrk_drake.experiments.study import RandomPoses, Study, Variation
+from dvrk_drake.experiments.study_measures import Measure
+from dvrk_drake.experiments.study_run import run_study
+from dvrk_drake.experiments.study_table import Quantiles, Share, StudyTable, summarise
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.reports.image_files import write_images

@@ -7,8 +7,7 @@ import pytest
 from pydrake.systems.analysis import Simulator
 
 from dvrk_drake.cli import main
-from dvrk_drake.experiments.demo.teleoperation import SCALE, play_teleoperation, run_live_teleoperation
-from dvrk_drake.experiments.demo.teleoperation_scene import start_scene
+from dvrk_drake.experiments.teleoperation import SCALE, play_teleoperation, run_live_teleoperation, start_scene
 
 
 @pytest.mark.slow
@@ -56,7 +55,7 @@ def test_live_scene_responds_to_sliders_and_buttons(monkeypatch):
                 plan.pop(due)()
             super().AdvanceTo(time)
 
-    monkeypatch.setattr("dvrk_drake.experiments.demo.teleoperation.Simulator", Watched)
+    monkeypatch.setattr("dvrk_drake.experiments.teleoperation.Simulator", Watched)
     run_live_teleoperation(meshcat, duration=10.0)
     assert not plan
     np.testing.assert_allclose(tips[1.3], tips[0.1], atol=1e-5)  # open, then closed at rest
@@ -67,7 +66,7 @@ def test_live_scene_responds_to_sliders_and_buttons(monkeypatch):
 
 def test_cli_writes_recording_and_errors(tmp_path, monkeypatch, capsys):
     short = partial(play_teleoperation, duration=0.6)
-    monkeypatch.setattr("dvrk_drake.experiments.demo.teleoperation.play_teleoperation", short)
+    monkeypatch.setattr("dvrk_drake.experiments.teleoperation.play_teleoperation", short)
     page = tmp_path / "teleop.html"
     assert main(["simulate", "teleop", "--output", str(page)]) == 0
     assert "<html" in page.read_text()

@@ -8,7 +8,7 @@ import pytest
 from command_output import refusal, refused
 
 from dvrk_drake.cli import main
-from dvrk_drake.experiments.study.study_file import load_study
+from dvrk_drake.experiments.study import load_study
 from dvrk_drake.models.arm_files import load_arm
 
 STUDY = """
@@ -82,7 +82,7 @@ def test_rejects_invalid_schedulers(study, capsys):
     )
     # The threads of a Dask client would remain in the process of the tests.
     code = (
-        "import sys, dvrk_drake.cli, dvrk_drake.experiments.study.study as study; study.TIMEOUT = 0.3;"
+        "import sys, dvrk_drake.cli, dvrk_drake.experiments.study_run as study; study.TIMEOUT = 0.3;"
         "sys.exit(dvrk_drake.cli.main(sys.argv[1:]))"
     )
     options = ["--scheduler", "tcp://127.0.0.1:1", "--output", study.parent / "new.csv"]

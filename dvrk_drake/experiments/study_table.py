@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.errors import RecordingError, StudyError
-from dvrk_drake.experiments.study.measures import Measure
-from dvrk_drake.experiments.study.study_file import Case, Study
+from dvrk_drake.experiments.study import Case, Study
+from dvrk_drake.experiments.study_measures import Measure
 from dvrk_drake.models.files import GrowingFile, atomic_write, read_input
 from dvrk_drake.recordings.csv_files import column_names
 

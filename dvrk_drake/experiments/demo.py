@@ -34,7 +34,7 @@ MAX_SHIFT = 0.002
 MAX_ANGLE = 2.0
 #: Time of the release, and duration of the motion after it [s].
 RELEASE_TIME, DURATION = 1.0, 4.0
-_PLANS = Path(__file__).with_name("plans.yaml")
+_PLANS = Path(__file__).with_name("demo_plans.yaml")
 
 
 @dataclass

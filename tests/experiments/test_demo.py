@@ -8,7 +8,7 @@ import pytest
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.inertial_parameters import link_inertias
-from dvrk_drake.experiments.demo import demo
+from dvrk_drake.experiments import demo
 from dvrk_drake.experiments.ground_truth import (
     APPROACH,
     MIN_APPROACH,

@@ -1,1 +1,0 @@
-"""Simulation studies over poses, seeds and parameter errors, on all cores or on a cluster."""
