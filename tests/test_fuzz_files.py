@@ -32,7 +32,7 @@ from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.experiments.paper import PaperRecordings
 from dvrk_drake.experiments.scenario import load_scenario
 from dvrk_drake.experiments.study import load_study
-from dvrk_drake.experiments.study_table import Row, StudyTable
+from dvrk_drake.experiments.study_run import Row, StudyTable
 from dvrk_drake.export.dvrk_mtm_gravity_compensation import CompensationOptions, compensation_from_model
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
 from dvrk_drake.export.dvrk_psm_gravity_compensation import kinematic_compensation

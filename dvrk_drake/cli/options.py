@@ -73,13 +73,13 @@ def _check_seed(_: object, value: int) -> None:
         raise ValueError("must be a whole number, 0 or larger")
 
 
-def one_of(title: str, least: int = 1) -> Group:
-    """Returns a group of mutually exclusive options. If `least` is 1, one of the options is required."""
+def one_of(title: str) -> Group:
+    """Returns a group of options of which exactly one is required."""
 
     def check(arguments: ArgumentCollection) -> None:
-        if not least <= sum(argument.has_tokens for argument in arguments) <= 1:
+        if sum(argument.has_tokens for argument in arguments) != 1:
             names = ", ".join(argument.name for argument in arguments)
-            raise ValueError(f"give {'exactly' if least else 'at most'} one of {names}")
+            raise ValueError(f"give exactly one of {names}")
 
     return Group(title, validator=check, sort_key=0)
 

@@ -18,7 +18,6 @@ from dvrk_drake.progress import step_progress
 _FILE = options.FileOptions()
 _RESULTS = Results()
 _SCENARIO = options.one_of("Source (one is required)")
-_EXECUTOR = options.one_of("Computers (at most one option)", least=0)
 
 
 @options.simulate.default
@@ -89,9 +88,8 @@ def study(
     output: Annotated[str, Parameter(metavar="RESULTS.csv")],
     set: options.Set = None,
     workers: Annotated[
-        int | None, Parameter(metavar="N", group=_EXECUTOR, converter=options.whole_number, validator=_check_workers)
+        int | None, Parameter(metavar="N", converter=options.whole_number, validator=_check_workers)
     ] = None,
-    scheduler: Annotated[str | None, Parameter(metavar="ADDRESS", group=_EXECUTOR)] = None,
     results: Results = _RESULTS,
 ) -> None:
     """Simulate a scenario with many poses, seeds and variations.
@@ -100,10 +98,9 @@ def study(
         study: YAML file of the study.
         output: Results file (.csv). If it exists, only missing runs of the study are simulated.
         workers: Number of processes on this computer, 1 to 1024. Default: one per core.
-        scheduler: Address of a Dask cluster that runs the study, e.g. tcp://host:8786.
     """
     from dvrk_drake.experiments.study import load_study
-    from dvrk_drake.experiments.study_run import dask_executor, run_study, run_study_locally
+    from dvrk_drake.experiments.study_run import run_study_locally
     from dvrk_drake.reports.study import study_page
 
     loaded = load_study(study, set or [])
@@ -117,11 +114,7 @@ def study(
         def show(done: int, all_cases: int) -> None:
             steps(step, done / all_cases)
 
-        if scheduler is None:
-            rows = run_study_locally(loaded, output, workers, show)
-        else:
-            with dask_executor(scheduler) as executor:
-                rows = run_study(loaded, executor, output, show)
+        rows = run_study_locally(loaded, output, workers, show)
     page = study_page(loaded, rows, study_path=study + _set_options(set) if results.plots is None else None)
     results.show(page, study, output, saved=output)
 

@@ -1,30 +1,42 @@
-"""Execution of a study on the local cores or on a Dask cluster. Each result is written to the table immediately."""
+"""Execution of a study in worker processes, and the table of its results, which interruptions do not damage."""
 
 from __future__ import annotations
 
-import logging
-import re
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, as_completed
-from contextlib import contextmanager
+import csv
+import fcntl
+import io
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import BrokenExecutor, Executor, Future, as_completed
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import IO
 
 import numpy as np
 
-from dvrk_drake.errors import SimulationError, StudyError
+from dvrk_drake.errors import RecordingError, SimulationError, StudyError
 from dvrk_drake.experiments.scenario import Scenario
 from dvrk_drake.experiments.simulation import simulate
-from dvrk_drake.experiments.study import Case, Study, versions
+from dvrk_drake.experiments.study import Case, Study
 from dvrk_drake.experiments.study_measures import Measure
-from dvrk_drake.experiments.study_table import Row, StudyTable
+from dvrk_drake.models.files import GrowingFile, atomic_write, read_input
+from dvrk_drake.recordings.csv_files import column_names
 from dvrk_drake.workers import local_executor
-
-if TYPE_CHECKING:
-    from distributed import Client
 
 #: Function called with the number of finished cases and the number of all cases.
 Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Row:
+    """Result of a run.
+
+    Attributes:
+        values: Values of the measures, by column; empty for a failed run.
+        error: Error message in one line; empty unless the run failed.
+    """
+
+    values: Mapping[str, float | bool]
+    error: str = ""
 
 
 def run_study(
@@ -34,8 +46,7 @@ def run_study(
 
     Args:
         study: Study to run.
-        executor: Executor of threads or processes, or a Dask client's `get_executor(pure=False)`. Its workers need
-            this package and the files of the scenario.
+        executor: Executor of threads or processes.
         output: Path of a CSV file, see `StudyTable`. Existing rows of the same study are kept.
         progress: Function called at the start and after each run.
 
@@ -57,12 +68,11 @@ def run_study(
         try:
             for case in missing:
                 futures[executor.submit(run_case, study.scenario_of(case), study.measures)] = case
-            for future in as_completed(list(futures)):
-                case = futures.pop(future)
-                if loss := _loss(future):
-                    losses.append((case, loss))
+            for future in as_completed(futures):
+                if loss := future.exception():
+                    losses.append((futures[future], loss))
                 else:
-                    table.append(case, future.result())
+                    table.append(futures[future], future.result())
                     progress(len(table.rows), len(study.cases))
         except BrokenExecutor as broken:  # raised by submit
             losses.append((case, broken))
@@ -78,10 +88,6 @@ def run_study(
             ) from error
         table.sort()
         return table.rows
-
-
-def _loss(future: Future[Row]) -> BaseException | None:
-    return CancelledError("the workers were lost") if future.cancelled() else future.exception()
 
 
 def run_case(scenario: Scenario, measures: Sequence[Measure]) -> Row:
@@ -100,8 +106,6 @@ def run_case(scenario: Scenario, measures: Sequence[Measure]) -> Row:
 
 #: Maximum number of process pools. A pool is replaced if a worker was killed, e.g. for lack of memory.
 MAX_POOLS = 3
-#: Timeout of the connection to a scheduler, and of waiting for its first worker [s].
-TIMEOUT = 10
 
 
 def run_study_locally(study: Study, output: str | Path, workers: int | None, progress: Progress) -> dict[int, Row]:
@@ -120,50 +124,128 @@ def run_study_locally(study: Study, output: str | Path, workers: int | None, pro
     raise AssertionError("unreachable")
 
 
-@contextmanager
-def dask_executor(address: str) -> Iterator[Executor]:
-    """Connects to the workers of a Dask scheduler, e.g. "tcp://192.168.0.5:8786". Requires the extra `dask`.
+class StudyTable:
+    """Results of one study in a CSV file with a header and one row per run.
 
-    The workers need the same software versions, and the files of the scenario at the same paths. Use one thread per
-    worker (`dask worker --nthreads 1`), since simulations in one process block each other. The log of the client is
-    disabled.
+    Columns: study (fingerprint), case (number of the run), variation, pose (number of the start pose), seed (of the
+    scenario), q1..qn (start pose [rad, m]), one column per measure (a number, inf, true or false), and error. The error
+    is empty unless the run failed. The measures of a failed run are empty. Numbers have full precision.
 
-    Raises:
-        StudyError: The package distributed is not installed, the scheduler cannot be reached, or it has no
-            workers with the same software versions.
+    The table is a context manager. It locks the file against other processes.
     """
-    if not re.fullmatch(r"tcp://\S+:\d+", address):
-        raise StudyError(f'"{address}" is not the address of a scheduler; allowed: tcp://HOST:PORT')
-    try:
-        from distributed import Client
-    except ImportError as error:
-        raise StudyError("--scheduler requires the package distributed. Run: pip install 'dvrk-drake[dask]'") from error
-    for logger in ("distributed", "distributed.client"):
-        logging.getLogger(logger).setLevel(logging.CRITICAL)
-    try:
-        client = Client(address, timeout=TIMEOUT, set_as_default=False)
-    except (OSError, ValueError, TypeError) as error:
-        raise StudyError(f"{address}: no Dask scheduler answers at this address: {error}") from error
-    with client:
+
+    def __init__(self, path: str | Path, study: Study) -> None:
+        """Opens the table at `path`. The file is new or contains rows of the same study.
+
+        Raises:
+            StudyError: The file contains anything but rows of this study, or is locked by another process.
+            RecordingError: The file cannot be read or written.
+        """
+        self._path, self._study = Path(path), study
+        self._names = [measure.column for measure in study.measures]
+        self._starts = column_names("q", study.arm.num_joints)
+        self._header = ["study", "case", "variation", "pose", "seed", *self._starts, *self._names, "error"]
+        self._lock = _lock(self._path)
         try:
-            client.wait_for_workers(1, timeout=TIMEOUT)
-        except TimeoutError as error:
+            self.rows = self._read()
+            self._file = GrowingFile(self._path, resume=True)
+        except BaseException:
+            self._lock.close()
+            raise
+        if not self._path.stat().st_size:
+            self._file.append(_line(self._header))
+
+    def __enter__(self) -> StudyTable:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+        self._lock.close()
+
+    def append(self, case: Case, row: Row) -> None:
+        """Appends the row of a case that is not yet in the table.
+
+        Raises:
+            RecordingError: The row cannot be written. The earlier rows remain complete.
+        """
+        self._file.append(_line(self._cells(case, row)))
+        self.rows[case.index] = row
+
+    def sort(self) -> None:
+        """Sorts the rows by the number of the case and replaces the file atomically."""
+        with atomic_write(self._path, "wb") as stream:
+            stream.write(_line(self._header))
+            stream.writelines(_line(self._cells(case, self.rows[case.index])) for case in self._study.cases)
+
+    def _cells(self, case: Case, row: Row) -> list[str]:
+        key = [self._study.fingerprint, str(case.index), case.variation, str(case.pose), str(case.seed)]
+        values = [_text(row.values[name]) if name in row.values else "" for name in self._names]
+        return [*key, *map(repr, case.start), *values, row.error]
+
+    def _read(self) -> dict[int, Row]:
+        """Reads the complete rows of the file, by the number of the case."""
+        content, header = read_input(self._path, RecordingError), _line(self._header)
+        complete, line, rows = content[: content.rfind(b"\n") + 1], 1, dict[int, Row]()
+        if not complete and header.startswith(content):
+            return {}  # new file, or interrupted while writing the header
+        try:
+            if not complete.startswith(header):
+                raise ValueError("another header")
+            lines = csv.reader(io.StringIO(complete.decode(), newline=""), strict=True)
+            for line, cells in enumerate(lines, 1):
+                if line == 1:
+                    continue  # header
+                case, row = self._study.cases[int(cells[1])], self._row(cells)
+                if cells != self._cells(case, row) or case.index in rows:
+                    raise ValueError("no row of this case, or the second one")
+                rows[case.index] = row
+        except (ValueError, IndexError, csv.Error) as error:
             raise StudyError(
-                f"{address}: the scheduler has no workers. Start workers: dask worker {address}"
+                f"{self._path}, line {line}: the file exists, and this line is not a result of this study with the "
+                "present files and software versions. Give another output."
             ) from error
-        _check_workers(client)
-        # Dask would cache the results of pure functions and share them between studies.
-        yield client.get_executor(pure=False)
+        return rows
+
+    def _row(self, cells: list[str]) -> Row:
+        if cells[-1]:
+            return Row({}, cells[-1])
+        texts = cells[-1 - len(self._names) : -1]
+        return Row({name: _value(text) for name, text in zip(self._names, texts, strict=True)})
 
 
-def _check_workers(client: Client) -> None:
+def _line(cells: list[str]) -> bytes:
+    stream = io.StringIO()
+    csv.writer(stream, lineterminator="\n").writerow(cells)
+    return stream.getvalue().encode()
+
+
+def _text(value: float | bool) -> str:
+    return str(value).lower() if isinstance(value, bool) else repr(value)
+
+
+def _value(text: str) -> float | bool:
+    return text == "true" if text in ("true", "false") else float(text)
+
+
+def _lock(path: Path) -> IO[bytes]:
+    """Locks the file `path` until the returned stream is closed; creates the file if it does not exist."""
     try:
-        found = client.run(versions)
-    except ImportError as error:
-        raise StudyError(f"the Dask workers cannot import dvrk_drake: {error}") from error
-    for worker, worker_versions in found.items():
-        if worker_versions != versions():
-            raise StudyError(
-                f"{worker}: the worker has {worker_versions}, this computer has {versions()}. Install the same "
-                "versions."
-            )
+        file = open(path, "ab")  # noqa: SIM115
+    except OSError as error:
+        raise StudyError(f"{path}: cannot be written: {error.strerror}") from error
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        file.close()
+        raise StudyError(
+            f"{path}: another process is writing this file. Wait for it, or give another output."
+        ) from error
+    return file
+
+
+def wilson_interval(count: int, runs: int) -> tuple[float, float]:
+    """Returns Wilson's 95 % interval of the share count / runs, for independent runs."""
+    from scipy.stats import binomtest  # takes 0.3 s
+
+    interval = binomtest(count, runs).proportion_ci(method="wilson")
+    return float(interval.low), float(interval.high)

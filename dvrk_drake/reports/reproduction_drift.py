@@ -13,7 +13,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.experiments.paper import PAPER, ReproductionSession, with_zero_torque
 from dvrk_drake.experiments.paper_experiments import AXIS_POSES, mechanism_errors
 from dvrk_drake.experiments.releases import APPROACH, APPROACH_TIME, APPROACHED_RELEASE, BAND, SAMPLE_PERIOD, Drifts
-from dvrk_drake.experiments.study_table import Share
+from dvrk_drake.experiments.study_run import wilson_interval
 from dvrk_drake.experiments.tuning_model_based import friction
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import EFFECT_NAMES
@@ -47,9 +47,8 @@ def numbers(values: ArrayLike, pattern: str) -> tuple[str, ...]:
 
 def share(held: int, total: int) -> str:
     """Returns the share held / total, with its 95 % confidence interval (Wilson, 1927), as text."""
-    interval = Share.of(held, total)
-    low, high = 100 * interval.lower, 100 * interval.upper
-    return f"{held} of {total} ({100 * held / total:.1f} %, 95 % interval {low:.1f}..{high:.1f} %)"
+    low, high = wilson_interval(held, total)
+    return f"{held} of {total} ({100 * held / total:.1f} %, 95 % interval {100 * low:.1f}..{100 * high:.1f} %)"
 
 
 def reproduce_figure_5(session: ReproductionSession) -> Section:

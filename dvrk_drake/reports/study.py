@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dvrk_drake.experiments.study import Study
 from dvrk_drake.experiments.study_measures import Measure
-from dvrk_drake.experiments.study_table import Row, Share, Summary, summarise, values_of
+from dvrk_drake.experiments.study_run import Row, wilson_interval
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.reports.page import Block, Page, Plot, Section, Table, Text
 from dvrk_drake.reports.plot import SERIES, Curve, Panel
@@ -26,11 +27,13 @@ def study_page(study: Study, rows: Mapping[int, Row], *, study_path: str | None 
         rows: Mapping from the number of a case to its results.
         study_path: Path of the study, for the suggested next command. None if the figures were already written.
     """
-    summaries = summarise(study, rows)
     failed = [(c.index, c.variation, c.pose, c.seed, rows[c.index].error) for c in study.cases if _error(c.index, rows)]
     first = study.measures[0]
-    found = "; ".join(f"{s.variation}: {_headline(first, s, study.arm)}" for s in summaries[:_MAX_COUNT])
-    blocks: list[Block] = [_summary_table(study, rows, summaries)]
+    found = "; ".join(
+        f"{variation}: {_headline(first, values, study.arm)}"
+        for variation, values in list(_values(first, study, rows).items())[:_MAX_COUNT]
+    )
+    blocks: list[Block] = [_summary_table(study, rows)]
     if failed:
         blocks.append(Text("A run that failed counts as the worst result."))
     blocks.append(
@@ -67,40 +70,51 @@ def _error(index: int, rows: Mapping[int, Row]) -> str:
     return rows[index].error if index in rows else ""
 
 
-def _summary_table(study: Study, rows: Mapping[int, Row], summaries: Sequence[Summary]) -> Table:
+def _values(measure: Measure, study: Study, rows: Mapping[int, Row]) -> dict[str, NDArray[np.float64]]:
+    """Returns the value of each run by variation. Failed runs have the worst value."""
+    found = {
+        variation.name: [rows[c.index] for c in study.cases if c.variation == variation.name and c.index in rows]
+        for variation in study.variations
+    }
+    return {
+        name: np.array([row.values.get(measure.column, measure.worst) for row in own], float)
+        for name, own in found.items()
+        if own
+    }
+
+
+def _summary_table(study: Study, rows: Mapping[int, Row]) -> Table:
     cells = [
-        (measure.column if k == 0 else "", summary.variation, *_cells(measure, summary, study.arm))
+        (measure.column if k == 0 else "", variation, *_summary(measure, values, study.arm))
         for measure in study.measures
-        for k, summary in enumerate(summaries)
+        for k, (variation, values) in enumerate(_values(measure, study, rows).items())
     ]
     header = ("measure", "variation", "share or median", "95 % interval or percentile", "largest")
     return Table(header, cells, f"{study.arm.name}, {len(rows)} runs")
 
 
-def _headline(measure: Measure, summary: Summary, arm: Arm) -> str:
-    value = summary.measures[measure.column]
-    if isinstance(value, Share):
-        return f"{value.count} of {value.runs} runs"
-    return f"median {value.median:.4g} {measure.unit(arm)}".strip()
+def _headline(measure: Measure, values: NDArray[np.float64], arm: Arm) -> str:
+    if measure.is_boolean:
+        return f"{values.sum():.0f} of {len(values)} runs"
+    return f"median {_summary(measure, values, arm)[0]}"
 
 
-def _cells(measure: Measure, summary: Summary, arm: Arm) -> list[str]:
-    value = summary.measures[measure.column]
-    if isinstance(value, Share):
-        share = f"{100 * value.count / value.runs:.1f} %"
-        return [share, f"{100 * value.lower:.1f}..{100 * value.upper:.1f} %", ""]
-    return [
-        f"{number:.4g} {measure.unit(arm)}".strip() for number in (value.median, value.percentile_95, value.largest)
-    ]
+def _summary(measure: Measure, values: NDArray[np.float64], arm: Arm) -> list[str]:
+    """Returns share and interval, or median, 95th percentile and maximum."""
+    if measure.is_boolean:
+        low, high = wilson_interval(int(values.sum()), len(values))
+        return [f"{100 * values.mean():.1f} %", f"{100 * low:.1f}..{100 * high:.1f} %", ""]
+    # Do not interpolate between runs, since values can be infinite.
+    numbers = (*np.quantile(values, [0.5, 0.95], method="inverted_cdf"), values.max())
+    return [f"{number:.4g} {measure.unit(arm)}".strip() for number in numbers]
 
 
 def _panel(measure: Measure, study: Study, rows: Mapping[int, Row]) -> Panel:
     curves, smallest, infinite = [], math.inf, 0
-    for i, variation in enumerate(study.variations):
-        cases = [c for c in study.cases if c.variation == variation.name and c.index in rows]
-        values = values_of(measure, [rows[c.index] for c in cases])
+    for i, (variation, values) in enumerate(_values(measure, study, rows).items()):
+        cases = [c for c in study.cases if c.variation == variation and c.index in rows]
         order = np.argsort(values)
-        share = 100 * np.arange(1, len(values) + 1) / max(len(values), 1)
+        share = 100 * np.arange(1, len(values) + 1) / len(values)
         finite = np.isfinite(values[order])  # the curve ends below 100 % if values are infinite
         infinite += int(np.count_nonzero(~finite))
         smallest = min(smallest, values.min(initial=math.inf))
@@ -109,7 +123,7 @@ def _panel(measure: Measure, study: Study, rows: Mapping[int, Row]) -> Panel:
             f"{a:.4g}, {b:.1f} % of the runs, case {cases[k].index}, pose {cases[k].pose}"
             for a, b, k in zip(x, y, order[finite], strict=True)
         ]
-        curves.append(Curve(variation.name, x, y, SERIES[i % len(SERIES)], "step", texts))
+        curves.append(Curve(variation, x, y, SERIES[i % len(SERIES)], "step", texts))
     unit = measure.unit(study.arm)
     return Panel(
         measure.title[0].upper()

@@ -41,7 +41,6 @@ def refused(capsys, *arguments):
         ("record r.csv --arm psm --duration nan", "must be a number of seconds greater than 0"),
         ("export --sdf out.sdf", "give exactly one of --model, --arm; see dvrk-drake export --help"),
         ("export --arm psm --model m.yaml --sdf o", "give exactly one of --model, --arm; see"),
-        ("simulate study s.yaml --output r.csv --workers 1 --scheduler x", "give at most one of"),
         ("simulate psm", "psm is an arm, not a scenario; use --arm psm"),
         ("export --model psm --sdf o", "psm is an arm, not a model; use --arm psm"),
         ("sim-arm --arm psm --rate 100", "--rate: only with --transport ros"),

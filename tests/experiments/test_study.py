@@ -16,11 +16,11 @@ from dvrk_drake.errors import SimulationError, StudyError
 from dvrk_drake.experiments.simulation import Simulation
 from dvrk_drake.experiments.study import RandomPoses, Study, Variation
 from dvrk_drake.experiments.study_measures import Measure
-from dvrk_drake.experiments.study_run import run_study
-from dvrk_drake.experiments.study_table import Quantiles, Share, StudyTable, summarise
+from dvrk_drake.experiments.study_run import StudyTable, run_study, wilson_interval
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.reports.image_files import write_images
+from dvrk_drake.reports.page import Table
 from dvrk_drake.reports.study import study_page
 
 MTM = load_arm("mtml")
@@ -179,7 +179,7 @@ def test_rejects_table_of_another_study_unchanged(change, reference, tmp_path):
     path = tmp_path / "partial_table.csv"
     partial_table = reference[: len(reference) // 2]
     path.write_bytes(partial_table)
-    with ThreadPoolExecutor(1) as executor, pytest.raises(StudyError, match="the results are from a different study"):
+    with ThreadPoolExecutor(1) as executor, pytest.raises(StudyError, match="is not a result of this study"):
         run_study(make_study(**change), executor, path)
     assert path.read_bytes() == partial_table
 
@@ -187,12 +187,12 @@ def test_rejects_table_of_another_study_unchanged(change, reference, tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda text: b"hello", "does not contain results of a study"),
-        (lambda text: b"t,q1,q2\n1,2,3\n", "does not contain results of a study"),
-        (lambda text: b"\xff\xfe\n", "does not contain results of a study"),
-        (lambda text: text + text.splitlines(keepends=True)[5], ", line 26: case 4 occurs twice"),
-        (lambda text: text.replace(b',3,"wrong', b',300,"wrong'), ", line 5: the line is not a result of this study"),
-        (lambda text: text.replace(b",false,", b",nearly,", 1), ": could not convert"),
+        (lambda text: b"hello", ", line 1: the file exists"),
+        (lambda text: b"t,q1,q2\n1,2,3\n", ", line 1: the file exists"),
+        (lambda text: b"\xff\xfe\n", ", line 1: the file exists"),
+        (lambda text: text + text.splitlines(keepends=True)[5], ", line 26: the file exists"),
+        (lambda text: text.replace(b',3,"wrong', b',300,"wrong'), ", line 5: the file exists"),
+        (lambda text: text.replace(b",false,", b",nearly,", 1), "is not a result of this study"),
     ],
 )
 def test_rejects_other_files_and_leaves_them_unchanged(change, message, reference, tmp_path):
@@ -228,24 +228,24 @@ def test_interrupted_study_keeps_rows_and_cancels_rest(reference, tmp_path):
     assert path.read_bytes() == reference
 
 
-def test_wilson_interval_counts_failed_runs_as_worst(tmp_path):
+def test_wilson_interval_bounds_are_1_96_standard_errors_from_share():
+    for p in wilson_interval(30, 120):
+        assert abs(30 / 120 - p) == pytest.approx(norm.ppf(0.975) * math.sqrt(p * (1 - p) / 120))
+
+
+def test_page_counts_failed_runs_as_worst(tmp_path):
     study = make_study(random_poses=RandomPoses(60, seed=1))
     with ThreadPoolExecutor(1) as executor:
         rows = run_study(study, executor, tmp_path / "r.csv")
-    (exact, wrong) = summarise(study, rows)
-    assert exact.runs == wrong.runs == 120
-    assert exact.failed == wrong.failed > 0  # the same seeds
-    held = exact.measures["held"]
-    assert isinstance(held, Share)
-    assert held.count > wrong.measures["held"].count > 0
-    # Wilson: the bounds are the shares p that are 1.96 standard errors away from the observed share.
-    for p in (held.lower, held.upper):
-        assert abs(held.count / 120 - p) == pytest.approx(norm.ppf(0.975) * math.sqrt(p * (1 - p) / 120))
-    drift = exact.measures["drift"]
-    assert isinstance(drift, Quantiles)
-    values = sorted(rows[c.index].values.get("drift", math.inf) for c in study.cases if c.variation == "exact")
-    assert (drift.median, drift.percentile_95, drift.largest) == (values[59], values[113], values[119])
-    assert drift.largest == math.inf
+    exact = [rows[c.index] for c in study.cases if c.variation == "exact"]
+    assert any(row.error for row in exact)
+    held = sum(row.values.get("held", False) for row in exact)
+    drifts = sorted(row.values.get("drift", math.inf) for row in exact)
+    table = next(block for block in study_page(study, rows).blocks if isinstance(block, Table))
+    share, low_and_high, _ = table.rows[0][2:]
+    low, high = wilson_interval(held, 120)
+    assert (share, low_and_high) == (f"{held / 1.2:.1f} %", f"{100 * low:.1f}..{100 * high:.1f} %")
+    assert list(table.rows[2][2:]) == [f"{drifts[59]:.4g} rad", f"{drifts[113]:.4g} rad", "inf rad"]
 
 
 def test_report_lists_all_measures_and_errors(tmp_path, monkeypatch):

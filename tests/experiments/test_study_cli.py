@@ -1,8 +1,5 @@
 """`dvrk-drake simulate study`: invalid input gives a one-line error before any simulation."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 from command_output import refusal, refused
@@ -73,22 +70,6 @@ def test_rejects_invalid_files_and_outputs(study, tmp_path, capsys):
     ):
         assert message in refused(capsys, "simulate", "study", study, "--output", output)
     assert study.read_text() == STUDY
-
-
-def test_rejects_invalid_schedulers(study, capsys):
-    pytest.importorskip("dask", reason="needs the extra dask")
-    assert "is not the address of a scheduler; allowed: tcp://HOST:PORT" in study_refusal(
-        capsys, study, "--scheduler", "here"
-    )
-    # The threads of a Dask client would remain in the process of the tests.
-    code = (
-        "import sys, dvrk_drake.cli, dvrk_drake.experiments.study_run as study; study.TIMEOUT = 0.3;"
-        "sys.exit(dvrk_drake.cli.main(sys.argv[1:]))"
-    )
-    options = ["--scheduler", "tcp://127.0.0.1:1", "--output", study.parent / "new.csv"]
-    command = [sys.executable, "-c", code, "simulate", "study", study, *options]
-    done = subprocess.run(command, check=False, capture_output=True, text=True)
-    assert done.returncode == 2 and "no Dask scheduler answers at this address" in refusal(done.stderr)
 
 
 def test_command_line_settings_override_file(study):

@@ -1,13 +1,11 @@
-"""Studies in processes and on a Dask cluster: interruptions lose no rows and do not change the results."""
+"""Studies in processes: interruptions lose no rows and do not change the results."""
 
-import json
 import os
 import signal
 import subprocess
 import sys
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
-from importlib.util import find_spec
 from pathlib import Path
 
 import formula_study
@@ -114,29 +112,6 @@ def test_study_survives_killed_process_and_worker(study, started, release_simula
     assert (second.returncode, messages(error)) == (0, [])
     assert "nominal: 2 of 5 runs" in output
     monkeypatch.delenv(formula_study.TICKETS)
-    assert path.read_bytes() == reference_table(study)
-
-
-@pytest.mark.skipif(not find_spec("distributed"), reason="needs the extra dask")
-def test_dask_cluster_survives_lost_worker(study, started, release_simulations, tmp_path, monkeypatch):
-    """The threads of a Dask client would remain in the process of the tests, so the client has its own process."""
-    path, address = tmp_path / "dask.csv", tmp_path / "scheduler.json"
-    options = ["--no-dashboard", "--scheduler-file", address]
-    scheduler = started("-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", 0, *options)
-    wait_until(lambda: address.exists() and address.stat().st_size, "the scheduler's address", scheduler)
-    url = json.loads(address.read_text())["address"]
-    worker = ["-m", "distributed.cli.dask_worker", "--nthreads", 1, "--no-nanny", "--preload", FORMULA, *options]
-    workers = [started(*worker), started(*worker)]
-    release_simulations(3)
-    run = started(FORMULA, "simulate", "study", study, "--output", path, "--scheduler", url)
-    wait_until(lambda: rows_in(path) == 3, "three rows", run)
-    workers[0].kill()
-    release_simulations(20)
-    output, error = run.communicate(timeout=TIMEOUT)
-    assert (run.returncode, messages(error)) == (0, [])
-    assert "nominal: 2 of 5 runs" in output
-    monkeypatch.delenv(formula_study.TICKETS)
-    monkeypatch.setattr(study_module, "simulate", formula_study.simulate)
     assert path.read_bytes() == reference_table(study)
 
 

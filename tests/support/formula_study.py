@@ -41,11 +41,6 @@ def simulate(scenario):
     return Simulation(Recording(q=q, qd=0 * q, tau=q / 10, t=t), np.hstack([q, 0 * q]), None, None)
 
 
-def dask_setup(_worker):
-    """Is called by a Dask worker with --preload."""
-    study_module.simulate = simulate
-
-
 _run_case = study_module.run_case
 
 
@@ -60,8 +55,7 @@ if __name__ == "__main__":
 
     from dvrk_drake.cli import main
 
-    if "--workers" in sys.argv:  # Dask workers call `dask_setup`
-        study_module.run_case = formula_study.run_case
+    study_module.run_case = formula_study.run_case
     # A shell without job control starts background processes with SIGINT ignored.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     sys.exit(main(sys.argv[1:]))

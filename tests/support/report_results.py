@@ -5,7 +5,7 @@ import numpy as np
 import dvrk_drake as dvrk
 from dvrk_drake.experiments.study import RandomPoses, Study, Variation
 from dvrk_drake.experiments.study_measures import Measure
-from dvrk_drake.experiments.study_table import Row
+from dvrk_drake.experiments.study_run import Row
 from dvrk_drake.experiments.transparency import OperatorForces
 from dvrk_drake.experiments.tuning import CONDITIONS, OWN, PUBLISHED, Comparison, StepMeasures, Tuning
 from dvrk_drake.experiments.tuning_bench import Response, step_size
