@@ -363,4 +363,5 @@ def force(
         )
     if output is not None:
         result.save(output, overwrite=True)
-    results.show(force_page(result), recording, model, note=result.note, warnings=result.warnings, saved=output)
+    page = force_page(result, model_path=model, file_options=file.as_text())
+    results.show(page, recording, model, note=result.note, warnings=result.warnings, saved=output)

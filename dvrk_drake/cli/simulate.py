@@ -60,10 +60,11 @@ def simulate_scenario(
         print(f"{loaded.mounted_arm.name} at {page.web_url()}", flush=True)
     with support.Steps("simulating") as steps:
         simulation = dvrk.simulate(loaded, meshcat=page, progress=steps)
-    argument = (scenario or f"--arm {arm}") + _set_options(set) if results.plots is None else None
+    command = f"dvrk-drake simulate {scenario or f'--arm {arm}'}{_set_options(set)}"
     if output is not None:
         dvrk.write_recording(simulation.recording, output, loaded.mounted_arm, simulation.setpoints)
-    result = simulation_page(simulation, loaded.mounted_arm, scenario=argument)
+    next_step = f"{command} --plots FOLDER" if results.plots is None else "" if meshcat else f"{command} --meshcat"
+    result = simulation_page(simulation, loaded.mounted_arm, next_step=next_step)
     results.show(result, scenario, saved=output)
     if page is not None:
         print("the page can replay the motion; press Stop, Escape or Ctrl-C to end", flush=True)

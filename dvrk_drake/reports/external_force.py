@@ -28,11 +28,13 @@ from dvrk_drake.reports.plot import (
 _MAX_POINTS = 4000
 
 
-def force_page(result: ExternalForce) -> Page:
+def force_page(result: ExternalForce, *, model_path: str = "MODEL.yaml", file_options: str = "") -> Page:
     """Returns the page of an estimated force.
 
     Args:
         result: Result of `dvrk_drake.estimate_force`.
+        model_path: Path of the model, for the suggested next command.
+        file_options: Options with which the recording was read, beginning with a space, for the suggested next command.
     """
     arm = result.model.arm
     note = "The intervals contain 95 % of the errors on recordings similar to those of the model."
@@ -45,6 +47,8 @@ def force_page(result: ExternalForce) -> Page:
             Section("Joint efforts", [_effort_plot(result)]),
         ],
         "good" if np.any(result.measurable) else "warning",
+        f"dvrk-drake force FREE_MOTION.csv --model {model_path}{file_options}",
+        "Estimates the force of a motion without contact: the intervals of most rows must contain 0.",
     )
 
 
@@ -68,7 +72,9 @@ def _answer(result: ExternalForce) -> str:
     along = measurable[largest, known] / max(size[largest], 1e-12)
     deviation = np.sqrt(along @ result.covariance[largest][np.ix_(known, known)] @ along)
     when = f"pose {largest + 1}" if result.t is None else f"{_x(result)[largest]:.2f} s"
-    answer = f"Largest force at {result.frame}: {size[largest]:.2f} +- {half_width(deviation, None):.2f} N, at {when}."
+    half = half_width(deviation, None)
+    interval = f"95 % interval {size[largest] - half:.2f}..{size[largest] + half:.2f} N"
+    answer = f"Largest force at {result.frame}: {size[largest]:.2f} N ({interval}), at {when}."
     hidden = [name for name, seen in zip(_names(result), result.measurable.mean(0), strict=True) if seen < 0.5]
     if hidden:
         answer += f" The arm cannot measure {', '.join(hidden)} in most poses."
@@ -88,11 +94,11 @@ def _force_table(result: ExternalForce) -> Table:
         numbers = (np.mean(force), np.sqrt(np.mean(force**2)), np.max(np.abs(force)), np.median(width))
         rows.append((name, *(f"{x:.2f}" for x in numbers), share, detected))
     return Table(
-        ("", "mean [N]", "RMS [N]", "largest [N]", "interval +- [N]", "measurable*", "not 0**"),
+        ("", "mean [N]", "RMS [N]", "largest [N]", "95 % interval, half width [N]", "measurable*", "not 0**"),
         rows,
         f"Force at {_where(result)}",
         "* share of the rows in which the joints determine the component. ** share of these rows in which the 95 % "
-        "interval does not contain 0. interval: median of the half width.",
+        "interval does not contain 0. half width: median.",
     )
 
 

@@ -32,7 +32,7 @@ def payload_page(result: PayloadIdentification, *, model_path: str | None = None
     if not payload.found:
         answer = _none_found(payload, contradicting_links(payload, estimates))
     else:
-        answer = f"Payload: {payload.body.mass:.4f} +- {payload.mass_error:.4f} kg on {payload.link}."
+        answer = f"Payload: {payload.body.mass:.4f} kg on {payload.link} (95 % interval {_mass_interval(payload)} kg)."
     if payload.found and names and result.link is None:
         answer += f" A payload on {' or '.join(names)} explains the recordings equally well. Give the link with --link."
     elif payload.found and names:
@@ -63,35 +63,37 @@ def payload_page(result: PayloadIdentification, *, model_path: str | None = None
     )
 
 
+def _interval(value: float, error: float, payload: Payload) -> str:
+    """Returns the confidence interval of a value with its standard error."""
+    reach = payload.quantile * error
+    return f"{value - reach:.4f}..{value + reach:.4f}"
+
+
+def _mass_interval(payload: Payload) -> str:
+    return _interval(payload.body.mass, payload.mass_error, payload)
+
+
 def _estimate_table(payload: Payload) -> Table:
-    numbers = [("mass [kg]", payload.body.mass, payload.mass_error, "")]
-    for axis, x, error, base in zip(
-        "xyz", payload.body.position, payload.position_error, payload.position_in_base, strict=True
-    ):
-        numbers.append((f"{axis} [m]", x, error, f"{base:+.4f}"))
-    rows = []
-    for k, (name, value, error, base) in enumerate(numbers):
-        if k and not payload.body.determined[k - 1]:
-            rows.append((name, "not determined", "", "", ""))
-            continue
-        reach = payload.quantile * error
-        rows.append((name, f"{value:+.4f}", f"{error:.4f}", f"{value - reach:+.4f}..{value + reach:+.4f}", base))
-    header = ("", "estimate", "standard error", f"{100 * CONFIDENCE:.0f} % interval", "base frame, q = 0")
-    caption = f"Payload on {payload.link}, position in the frame of the link"
-    return Table(header, rows, caption)
+    rows = [("mass [kg]", f"{payload.body.mass:.4f}", _mass_interval(payload), "")]
+    position = zip(payload.body.position, payload.position_error, payload.position_in_base, strict=True)
+    for axis, determined, (x, error, base) in zip("xyz", payload.body.determined, position, strict=True):
+        numbers = (f"{x:+.4f}", _interval(x, error, payload), f"{base:+.4f}")
+        rows.append((f"{axis} [m]", *(numbers if determined else ("not determined", "", ""))))
+    header = ("", "estimate", f"{100 * CONFIDENCE:.0f} % interval", "base frame, q = 0")
+    return Table(header, rows, f"Payload on {payload.link}, position in the frame of the link")
 
 
 def _link_table(estimates: Sequence[Payload]) -> Table:
     """Returns the estimate for each link, best first."""
     good, rows = equally_good_links(estimates), []
     for payload in estimates:
-        note, mass, error = "none found", "-", "-"
+        note, mass, interval = "none found", "-", "-"
         if payload.found:
             note = "" if payload not in good else "best" if payload is estimates[0] else "equally good"
-            mass, error = f"{payload.body.mass:.4f}", f"{payload.mass_error:.4f}"
-        rows.append((payload.link, f"{100 * payload.relative_error:.1f} %", mass, error, note))
+            mass, interval = f"{payload.body.mass:.4f}", _mass_interval(payload)
+        rows.append((payload.link, f"{100 * payload.relative_error:.1f} %", mass, interval, note))
     return Table(
-        ("", "error*", "mass [kg]", "standard error [kg]", ""),
+        ("", "error*", "mass [kg]", f"{100 * CONFIDENCE:.0f} % interval [kg]", ""),
         rows,
         "Estimates by link, best first",
         "* whitened RMS error with payload / whitened RMS error without payload, cross-validated over the phase of the "

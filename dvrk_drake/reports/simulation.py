@@ -30,14 +30,13 @@ _SMALLEST_RANGE, _SMALLEST_ERROR_RANGE = 0.02, 0.004
 _NEAR_LIMIT = 0.5
 
 
-def simulation_page(simulation: Simulation, arm: Arm, *, scenario: str | None = None) -> Page:
+def simulation_page(simulation: Simulation, arm: Arm, *, next_step: str = "") -> Page:
     """Returns the largest tracking error or, without desired positions, the largest distance from the initial position.
 
     Args:
         simulation: Simulation.
         arm: Simulated arm.
-        scenario: Argument of the command that selects the scenario, for the suggested next command. None if the
-            command has already written figures.
+        next_step: Suggested next command. "": there is none.
     """
     recording, desired = simulation.recording, simulation.desired
     # In mrad or mm: errors of a controlled arm are small.
@@ -61,7 +60,7 @@ def simulation_page(simulation: Simulation, arm: Arm, *, scenario: str | None = 
         f"{what} relative to the range of the joint: {largest}, at the end {error[-1, j]:.2f} {unit}.",
         [Section("Joints", [table, _plot(simulation, arm)])],
         "good",
-        f"dvrk-drake simulate {scenario} --plots FOLDER" if scenario else "",
+        next_step,
     )
 
 

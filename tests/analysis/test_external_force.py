@@ -113,8 +113,10 @@ def test_refusals_are_one_line(pushed, poses):
 
 
 def test_page_states_the_force(estimate, tmp_path):
-    text = printed(force_page(estimate))
-    assert "Largest force at" in text and "measurable" in text
+    page = force_page(estimate)
+    text = printed(page)
+    assert "Largest force at" in text and "(95 % interval " in text and "measurable" in text
+    assert page.next_step.startswith("dvrk-drake force FREE_MOTION.csv")
     estimate.save(tmp_path / "force.csv")
     header = (tmp_path / "force.csv").read_text().splitlines()[0]
     assert header.startswith("t [s],force1 [N],force2 [N],force3 [N],force_lower1 [N]")

@@ -96,7 +96,9 @@ def checked(console, verbose, **changes):
 
 def simulated(console, verbose, settings):
     scenario = dvrk.load_scenario("psm", ["duration=0.1", *settings])
-    page = simulation.simulation_page(dvrk.simulate(scenario), scenario.mounted_arm, scenario="psm")
+    page = simulation.simulation_page(
+        dvrk.simulate(scenario), scenario.mounted_arm, next_step="dvrk-drake simulate psm"
+    )
     print_page(console, page, verbose=verbose)
 
 
@@ -137,7 +139,7 @@ CASES = {
     "check": (r"Verdict: usable", checked),
     "check, refused": (r"Verdict: unusable \(wrong time\)\.", lambda c, v: checked(c, v, t=1000 * motions()[0].t)),
     "payload": (
-        r"Payload: 0\.\d{4} \+- 0\.\d{4} kg on \w+\.",
+        r"Payload: 0\.\d{4} kg on \w+ \(95 % interval 0\.\d{4}\.\.0\.\d{4} kg\)\.",
         lambda c, v: print_page(c, payload_page(payloads()), verbose=v),
     ),
     "payload, none": (
