@@ -122,7 +122,7 @@ def gravity_vector(_: object, tokens: Sequence[Token]) -> tuple[float, float, fl
 
             numbers = [configured_pitch(words[0])]
         elif is_mount and len(words) == 1 and words[0].startswith("/"):
-            from dvrk_drake.systems.ros.mount_topic import topic_gravity
+            from dvrk_drake.systems.ros.discovery import topic_gravity
 
             return topic_gravity(words[0])
         else:

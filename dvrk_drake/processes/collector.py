@@ -302,7 +302,7 @@ def _start_goals(
     session: ArmSession, output: str | Path, remaining: NDArray[np.float64], settings: CollectionSettings
 ) -> tuple[GoalController, ArmLink, RosRecorder] | None:
     """Connects to an arm that the dVRK moves, and starts a bag. Returns None if the operator stopped the command."""
-    from dvrk_drake.systems.ros.crtk_move_link import connect_move_link
+    from dvrk_drake.systems.ros.crtk_link import connect_move_link
 
     session.ready()
     arm, dialog, model = session.arm, session.dialog, ControlModel(session.model)

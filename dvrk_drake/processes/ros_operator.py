@@ -11,9 +11,8 @@ from dvrk_drake.errors import ControllerError
 from dvrk_drake.processes.arm_operator import ArmObservation, idle_reason
 from dvrk_drake.processes.control import FIRST_WAIT
 from dvrk_drake.systems.ros.crtk_bridge import MIN_RATE, RATE_TOLERANCE
-from dvrk_drake.systems.ros.crtk_client import CrtkObserver
+from dvrk_drake.systems.ros.crtk_client import CrtkObserver, JointMeasurement, shown
 from dvrk_drake.systems.ros.discovery import END_OTHER_PROCESS
-from dvrk_drake.systems.ros.joint_state_reader import JointMeasurement, shown
 
 #: Longest time until the first measurement [s]. A dVRK also publishes invalid measurements.
 _FIRST = 2.0

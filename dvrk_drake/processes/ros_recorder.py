@@ -21,9 +21,8 @@ from dvrk_drake.systems.ros.discovery import find_topic
 from dvrk_drake.systems.ros.open_domain import open_ros_domain
 
 if TYPE_CHECKING:
-    from dvrk_drake.systems.ros.domain import RosDomain
+    from dvrk_drake.systems.ros.domain import RosDomain, Subscription
     from dvrk_drake.systems.ros.messages import JointState
-    from dvrk_drake.systems.ros.topic import Subscription
 
 #: Messages of one topic that may arrive while the recorder writes. Older messages are lost.
 _DEPTH = 5000

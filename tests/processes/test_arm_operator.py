@@ -20,8 +20,7 @@ from dvrk_drake.processes.arm_operator import observe, reset_fault, stop_arm
 from dvrk_drake.processes.control import first_status
 from dvrk_drake.processes.ros_operator import observe_dvrk, stop_dvrk
 from dvrk_drake.reports.arm_status import status_page
-from dvrk_drake.systems.ros.crtk_client import CrtkObserver
-from dvrk_drake.systems.ros.joint_state_reader import JointMeasurement
+from dvrk_drake.systems.ros.crtk_client import CrtkObserver, JointMeasurement
 
 ALL_MODES = (Command.OFF, Command.HOLD, Command.POSITION, Command.EFFORT)
 

@@ -14,7 +14,7 @@ from dvrk_drake.processes.arm_controller import GoalController, MotionStyle
 from dvrk_drake.processes.collector import DELAY, CollectionSettings, Collector, approaches, estimated_duration, summary
 from dvrk_drake.processes.ros_recorder import bag_path
 from dvrk_drake.recordings.reading import read_recording
-from dvrk_drake.systems.ros.crtk_move_link import GOAL_PERIOD, CrtkMoveLink
+from dvrk_drake.systems.ros.crtk_link import GOAL_PERIOD, CrtkMoveLink
 
 #: Interval of the measurements [s].
 PERIOD = 0.01

@@ -10,9 +10,9 @@ from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.lcm_messages import decode
 from dvrk_drake.systems.driver import DvrkDriver
 from dvrk_drake.systems.guard.settings import GuardSettings, PlausibilitySettings
-from dvrk_drake.systems.ros import joint_state_reader
+from dvrk_drake.systems.ros import crtk_client
 from dvrk_drake.systems.ros.crtk_bridge import CrtkBridge
-from dvrk_drake.systems.ros.joint_state_reader import JointMeasurement
+from dvrk_drake.systems.ros.crtk_client import JointMeasurement
 
 MS = 1_000_000
 START = 1_795_257_600 * 10**9
@@ -84,7 +84,7 @@ class CrtkBench:
     """
 
     def __init__(self, monkeypatch, name="mtml", *, period=1.0, modes=("position", "effort"), key_file=""):
-        monkeypatch.setattr(joint_state_reader, "time", self)
+        monkeypatch.setattr(crtk_client, "time", self)
         self.now, self.statuses, self.lines, self.blocked = 10_000 * MS, [], [], ""
         self.client, self.period = SubstituteClient(name), period
         n = self.client.arm.num_joints

@@ -26,9 +26,8 @@ def main(domain, reliable):
     from cyclonedds.topic import Topic
 
     from dvrk_drake.models.arm_files import load_arm
-    from dvrk_drake.systems.ros.domain import RosDomain
+    from dvrk_drake.systems.ros.domain import RosDomain, dds_topic, ros_qos
     from dvrk_drake.systems.ros.messages import Header, JointState, Time
-    from dvrk_drake.systems.ros.topic import dds_topic, ros_qos
 
     joints = list(load_arm("psm").joint_names)
     participant = RosDomain(domain).participant

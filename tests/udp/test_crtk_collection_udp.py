@@ -38,8 +38,8 @@ COMMAND = [
     "import sys\n"
     "from dvrk_drake.cli import main\n"
     "from dvrk_drake.processes import arm_mover\n"
-    "from dvrk_drake.systems.ros import crtk_move_link\n"
-    "crtk_move_link.SILENCE, arm_mover.STALL, arm_mover.SETTLE = 30.0, 100.0, 100.0\n"
+    "from dvrk_drake.systems.ros import crtk_link\n"
+    "crtk_link.SILENCE, arm_mover.STALL, arm_mover.SETTLE = 30.0, 100.0, 100.0\n"
     "sys.exit(main(sys.argv[1:]))",
 ]
 #: Program that could move the arm.

@@ -13,7 +13,7 @@ from pydrake.math import RigidTransform
 from dvrk_drake.dynamics.kinematics import ArmFrame
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.systems.ros.crtk_arm_state import REFUSED, ArmValues, CrtkArmState, CrtkCommand
-from dvrk_drake.systems.ros.domain import RosDomain
+from dvrk_drake.systems.ros.domain import Publisher, RosDomain, Subscription
 from dvrk_drake.systems.ros.messages import (
     Bool,
     Empty,
@@ -30,7 +30,6 @@ from dvrk_drake.systems.ros.messages import (
     TwistStamped,
     Vector3,
 )
-from dvrk_drake.systems.ros.topic import Publisher, Subscription
 
 #: Time between two checks for subscriptions [s].
 _SUBSCRIBERS_PERIOD = 0.1

@@ -17,10 +17,10 @@ from dvrk_drake.systems.guard.command_guard import CommandGuard
 from dvrk_drake.systems.guard.command_inbox import CommandInbox
 from dvrk_drake.systems.guard.follower import GuardOutput
 from dvrk_drake.systems.lcm.messages import draw_id, fill_in_guard
-from dvrk_drake.systems.ros.crtk_client import CrtkClient, connect_client
+from dvrk_drake.systems.ros.crtk_client import ArrivalClock, CrtkClient, connect_client
 from dvrk_drake.systems.ros.deadman import DeadmanProcess, describe_priority
 from dvrk_drake.systems.ros.discovery import END_OTHER_PROCESS
-from dvrk_drake.systems.ros.joint_state_reader import ArrivalClock
+from dvrk_drake.systems.ros.domain import Publisher
 from dvrk_drake.systems.ros.messages import (
     Float64MultiArray,
     Header,
@@ -32,7 +32,6 @@ from dvrk_drake.systems.ros.messages import (
     WrenchStamped,
 )
 from dvrk_drake.systems.ros.open_domain import open_ros_domain
-from dvrk_drake.systems.ros.topic import Publisher
 
 #: Lowest rate of measured_js for POSITION and EFFORT [Hz].
 MIN_RATE = 500.0

@@ -17,12 +17,13 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from dvrk_drake.errors import DvrkDrakeError
-from dvrk_drake.systems.ros.confirmation import repeat_until_confirmed
 from dvrk_drake.systems.ros.open_domain import open_ros_domain
 
 if TYPE_CHECKING:
     from dvrk_drake.systems.ros.domain import RosDomain
 
+#: Time between two attempts without confirmation [s].
+_INTERVAL = 0.25
 #: Time without a command after which the arm is commanded to hold its pose [s].
 TIMEOUT = 0.05
 #: Time between two checks for commands, and between two checks of the connection to the arm [s].
@@ -39,6 +40,30 @@ _SILENCE = 1.0
 _READY, _BLIND = "ready", "blind"
 #: Real-time priority, above that of the other processes of this package.
 _PRIORITY = 60
+
+
+def repeat_until_confirmed(attempt: Callable[[float], bool], is_over: Callable[[], bool]) -> bool:
+    """Repeats an attempt to send a message until two attempts in succession are confirmed. Returns whether they are.
+
+    One confirmation is not sufficient. A subscription that DDS discovers again after a loss of the network does not
+    receive the messages that were published before, but confirms them.
+
+    Args:
+        attempt: Function that publishes the message, and waits for its confirmation at most the given time [s]. It
+            returns whether the arm is connected and has confirmed the message.
+        is_over: Function that returns whether to stop. It is called after each attempt without confirmation.
+    """
+    missing = 2
+    while missing:
+        begin = time.monotonic()
+        if attempt(_INTERVAL):
+            missing -= 1
+            continue
+        missing = 2
+        if is_over():
+            return False
+        time.sleep(max(0.0, begin + _INTERVAL - time.monotonic()))
+    return True
 
 
 class Deadman:

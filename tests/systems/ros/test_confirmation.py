@@ -12,8 +12,7 @@ import ros_arm
 from ros_publisher import DOMAIN_FILE
 from waiting import TIMEOUT
 
-from dvrk_drake.systems.ros import confirmation
-from dvrk_drake.systems.ros.confirmation import repeat_until_confirmed
+from dvrk_drake.systems.ros.deadman import repeat_until_confirmed
 
 ros = pytest.importorskip("dvrk_drake.systems.ros.domain", reason="needs cyclonedds")
 from dvrk_drake.systems.ros.deadman import DeadmanProcess  # noqa: E402
@@ -30,7 +29,7 @@ def time_limit(seconds):
 
 @pytest.mark.parametrize("attempts", ["yy", "nyy", "ynyy", "nynnyy"])
 def test_two_attempts_in_succession_must_be_confirmed(monkeypatch, attempts):
-    monkeypatch.setattr(confirmation, "_INTERVAL", 0.0)
+    monkeypatch.setattr("dvrk_drake.systems.ros.deadman._INTERVAL", 0.0)
     left = list(attempts)
     assert repeat_until_confirmed(lambda longest: left.pop(0) == "y", time_limit(TIMEOUT))
     assert not left
@@ -38,7 +37,7 @@ def test_two_attempts_in_succession_must_be_confirmed(monkeypatch, attempts):
 
 @pytest.mark.parametrize("attempts", ["n", "yn"])
 def test_message_that_is_never_confirmed(monkeypatch, attempts):
-    monkeypatch.setattr(confirmation, "_INTERVAL", 0.001)
+    monkeypatch.setattr("dvrk_drake.systems.ros.deadman._INTERVAL", 0.001)
     results = itertools.cycle(attempts)
     assert not repeat_until_confirmed(lambda longest: next(results) == "y", time_limit(0.05))
 

@@ -12,7 +12,7 @@ from waiting import TIMEOUT
 pytest.importorskip("cyclonedds", reason="needs cyclonedds")
 
 from dvrk_drake.errors import DvrkDrakeError
-from dvrk_drake.systems.ros import confirmation, deadman
+from dvrk_drake.systems.ros import deadman
 from dvrk_drake.systems.ros.deadman import Deadman, DeadmanProcess
 
 ARM = "/MTML"
@@ -160,7 +160,7 @@ def test_hold_is_not_repeated_after_the_end_of_the_bridge():
 @pytest.fixture
 def fast(monkeypatch):
     """Makes the time between two attempts, and until the first warning, short."""
-    monkeypatch.setattr(confirmation, "_INTERVAL", 0.001)
+    monkeypatch.setattr(deadman, "_INTERVAL", 0.001)
     monkeypatch.setattr(deadman, "_CONFIRMATION", 0.01)
 
 

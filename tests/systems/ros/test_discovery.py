@@ -10,7 +10,7 @@ from dvrk_drake.cli import main
 from dvrk_drake.errors import DvrkDrakeError, RecordingError
 from dvrk_drake.models.arm_files import known_arms, load_arm
 from dvrk_drake.systems.ros.crtk_client import connect_client
-from dvrk_drake.systems.ros.crtk_move_link import connect_move_link
+from dvrk_drake.systems.ros.crtk_link import connect_move_link
 from dvrk_drake.systems.ros.discovery import find_topic, topic_fault
 from dvrk_drake.systems.ros.open_domain import domain_number, open_ros_domain
 
@@ -217,7 +217,7 @@ def test_ctrl_c_ends_the_wait_for_an_arm_that_is_not_ready(stop, monkeypatch):
     """`collect poses --transport ros` waits 2 s for an arm that is enabled and homed."""
     domain = SilentDomain()
     client = SimpleNamespace(namespace="/MTML", not_ready_reason="operating_state is DISABLED", receive=lambda: None)
-    monkeypatch.setattr("dvrk_drake.systems.ros.crtk_move_link.connect_client", lambda *arguments, **options: client)
+    monkeypatch.setattr("dvrk_drake.systems.ros.crtk_link.connect_client", lambda *arguments, **options: client)
     with pytest.raises(DvrkDrakeError, match="the connection to /MTML was stopped; no command was sent to the arm"):
         connect_move_link(domain, ARM, None, None, 0.6, stopped=lambda: domain.time >= stop)
     assert domain.time <= stop + LONGEST

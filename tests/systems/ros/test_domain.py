@@ -21,7 +21,7 @@ from dvrk_drake.errors import DvrkDrakeError
 
 module = pytest.importorskip("dvrk_drake.systems.ros.domain", reason="needs cyclonedds")
 messages = pytest.importorskip("dvrk_drake.systems.ros.messages", reason="needs cyclonedds")
-topic_module = pytest.importorskip("dvrk_drake.systems.ros.topic", reason="needs cyclonedds")
+topic_module = pytest.importorskip("dvrk_drake.systems.ros.domain", reason="needs cyclonedds")
 pytestmark = pytest.mark.network
 
 JointState, OperatingState, StringStamped = messages.JointState, messages.OperatingState, messages.StringStamped

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.systems.ros import joint_state_reader
-from dvrk_drake.systems.ros.joint_state_reader import ArrivalClock, JointStateReader, shown
+from dvrk_drake.systems.ros import crtk_client
+from dvrk_drake.systems.ros.crtk_client import ArrivalClock, JointStateReader, shown
 from dvrk_drake.systems.ros.messages import Header, JointState, Time
 
 pytest.importorskip("cyclonedds", reason="needs cyclonedds")
@@ -164,7 +164,7 @@ class Clocks:
 @pytest.fixture
 def clocks(monkeypatch):
     clocks = Clocks()
-    monkeypatch.setattr(joint_state_reader, "time", clocks)
+    monkeypatch.setattr(crtk_client, "time", clocks)
     return clocks
 
 

@@ -10,8 +10,8 @@ pytest.importorskip("cyclonedds", reason="needs cyclonedds")
 
 from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.models.arm import mount_gravity
+from dvrk_drake.systems.ros.discovery import topic_gravity
 from dvrk_drake.systems.ros.messages import Pose, PoseStamped, Quaternion
-from dvrk_drake.systems.ros.mount_topic import topic_gravity
 
 TOPIC = "/SUJ/PSM1/local/measured_cp"
 
