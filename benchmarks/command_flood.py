@@ -52,7 +52,7 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.lcm_messages import MessageKey, command_channel, create_key_file, status_channel
 from dvrk_drake.processes.pace import make_realtime
-from dvrk_drake.systems.lcm.lcm_network import handle_message
+from dvrk_drake.systems.lcm.messages import handle_message
 
 ARM = load_arm("mtml")
 KINDS = ("garbage", "session", "sender", "copy")

@@ -47,8 +47,7 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.lcm_messages import command_channel, status_channel
 from dvrk_drake.processes.pace import Pace, make_realtime
-from dvrk_drake.systems.lcm.lcm_network import handle_message
-from dvrk_drake.systems.lcm.messages import draw_id
+from dvrk_drake.systems.lcm.messages import draw_id, handle_message
 from dvrk_drake.systems.ros.domain import RosDomain
 from dvrk_drake.systems.ros.messages import Empty, Header, JointState, OperatingState
 

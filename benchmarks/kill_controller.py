@@ -44,7 +44,7 @@ from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.pace import make_realtime, settle_memory
 from dvrk_drake.processes.simulated_arm import SimulatedArm, monotonic_utime, start_pose, stop_on_signals
 from dvrk_drake.systems.driver import DvrkDriver
-from dvrk_drake.systems.lcm.lcm_network import usable_lcm_url
+from dvrk_drake.systems.lcm.messages import usable_lcm_url
 
 CONDITIONS = {"alone": 0, "two busy processes": 2}
 #: Minimum and maximum time for which efforts act before the kill [s].

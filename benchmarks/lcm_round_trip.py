@@ -47,7 +47,7 @@ from dvrk_drake.models.lcm_messages import command_channel, status_channel
 from dvrk_drake.processes.pace import Pace, make_realtime, settle_memory
 from dvrk_drake.processes.simulated_arm import SimulatedArm, start_pose
 from dvrk_drake.systems.driver import DvrkDriver
-from dvrk_drake.systems.lcm.lcm_network import handle_message, listen, usable_lcm_url
+from dvrk_drake.systems.lcm.messages import handle_message, listen, usable_lcm_url
 
 ARM = load_arm("mtml")
 ARMS = ("standing", "simulated")

@@ -25,8 +25,7 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.lcm_messages import MessageKey, StatusFilter
 from dvrk_drake.systems.guard.command_guard import CommandGuard
-from dvrk_drake.systems.guard.command_inbox import CommandInbox
-from dvrk_drake.systems.lcm.messages import fill_in_guard
+from dvrk_drake.systems.lcm.messages import CommandInbox, fill_in_guard
 
 ARM = load_arm("mtml")
 N = ARM.num_joints

@@ -29,8 +29,7 @@ from ros_bridge import CommandMonitor, start_bridge
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.lcm_messages import command_channel, status_channel
-from dvrk_drake.systems.lcm.lcm_network import handle_message
-from dvrk_drake.systems.lcm.messages import draw_id
+from dvrk_drake.systems.lcm.messages import draw_id, handle_message
 from dvrk_drake.systems.ros.domain import RosDomain
 
 FOLDER = Path(__file__).parent / "ros2_client"

@@ -274,7 +274,7 @@ def test_damaged_file_is_read_or_rejected(name, valid):
 
 #: Functions that take long or require an arm. Commands call them after reading their files.
 WORK = (
-    "dvrk_drake.systems.lcm.lcm_network.usable_lcm_url",
+    "dvrk_drake.systems.lcm.messages.usable_lcm_url",
     "dvrk_drake.experiments.tuning.tune_arm",
     "dvrk_drake.experiments.study_run.run_study_locally",
     "dvrk_drake.experiments.transparency.simulate_operator",

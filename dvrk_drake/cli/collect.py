@@ -44,7 +44,7 @@ def record(
         file: New file: .mcap for a bag for ROS 2 tools, Foxglove and Rerun. With LCM also .csv, or .log for an LCM log.
         duration: Duration [s], counted from the first message. Default: until Ctrl-C.
     """
-    from dvrk_drake.processes.live_status import LiveLine
+    from dvrk_drake.processes.control import LiveLine
     from dvrk_drake.processes.simulated_arm import stop_on_signals
 
     connected.check()
@@ -198,7 +198,7 @@ def _connection(
         confirms: Whether the operator must confirm the first motion, if there is a terminal.
         stop_on_contact: See `dvrk_drake.connect`.
     """
-    from dvrk_drake.processes.live_status import LiveLine
+    from dvrk_drake.processes.control import LiveLine
     from dvrk_drake.processes.teacher import EnterKey
 
     line = LiveLine(sys.stderr)

@@ -24,12 +24,9 @@ from cyclopts import (
 )
 
 from dvrk_drake.cli import (  # noqa: F401, these modules add their commands to the application
-    bridge,
     collect,
     control,
-    demo,
     excite,
-    export,
     identify,
     model,
     recordings,

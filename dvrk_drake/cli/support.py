@@ -259,7 +259,7 @@ def driver_configuration(path: str | None, key: str | None, lcm_url: str) -> Dvr
     """
     from dvrk_drake.processes.simulated_arm import load_driver
     from dvrk_drake.systems.driver import DvrkDriver
-    from dvrk_drake.systems.lcm.lcm_network import usable_lcm_url
+    from dvrk_drake.systems.lcm.messages import usable_lcm_url
 
     driver = DvrkDriver() if path is None else load_driver(path)
     driver.key_file = key or driver.key_file

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dvrk_drake.errors import CollectionError, DvrkDrakeError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status
 from dvrk_drake.processes.arm_controller import ArmController, GoalController
-from dvrk_drake.processes.live_status import AnswerTimes, takeover_reason
+from dvrk_drake.processes.control import AnswerTimes, takeover_reason
 from dvrk_drake.processes.teacher import RestDetector
 from dvrk_drake.systems.cubic_trajectory import CubicTrajectory
 

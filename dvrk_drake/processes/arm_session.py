@@ -21,15 +21,14 @@ from dvrk_drake.models.environment import Environment
 from dvrk_drake.models.lcm_messages import MessageKey
 from dvrk_drake.processes.arm_controller import ArmController, GoalController
 from dvrk_drake.processes.arm_operator import reset_fault
-from dvrk_drake.processes.control import FIRST_WAIT, SILENCE, StatusHandler, control, first_status
+from dvrk_drake.processes.control import FIRST_WAIT, SILENCE, LiveStatus, StatusHandler, control, first_status
 from dvrk_drake.processes.force_monitor import ForceMonitor
-from dvrk_drake.processes.live_status import LiveStatus
 from dvrk_drake.systems.driver import CrtkDriver
 from dvrk_drake.systems.friction_compensator import FrictionCompensator
 from dvrk_drake.systems.gravity_pid_controller import Mode
 from dvrk_drake.systems.guard.settings import GuardSettings
 from dvrk_drake.systems.lcm.arm_link import ArmLink, LcmArmLink
-from dvrk_drake.systems.lcm.lcm_network import usable_lcm_url
+from dvrk_drake.systems.lcm.messages import usable_lcm_url
 from dvrk_drake.systems.ros.open_domain import require_cyclonedds
 
 if TYPE_CHECKING:

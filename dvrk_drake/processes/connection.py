@@ -19,8 +19,8 @@ from dvrk_drake.models.lcm_messages import MessageKey, describe_state
 from dvrk_drake.processes.arm_operator import ArmObservation, observe, stop_arm
 from dvrk_drake.processes.arm_session import ArmSession, Dialog
 from dvrk_drake.processes.collector import CollectionSettings, Collector, collect_poses
+from dvrk_drake.processes.control import LiveStatus
 from dvrk_drake.processes.force_monitor import ForceMonitor
-from dvrk_drake.processes.live_status import LiveStatus
 from dvrk_drake.processes.motion_player import PlayedMotion, play_motion
 from dvrk_drake.processes.recorder import ArmRecorder, LcmRecorder
 from dvrk_drake.processes.ros_recorder import RosRecorder
@@ -29,7 +29,7 @@ from dvrk_drake.recordings.writer_stream import check_stream_output
 from dvrk_drake.systems.friction_compensator import FrictionCompensator
 from dvrk_drake.systems.gravity_pid_controller import Mode
 from dvrk_drake.systems.guard.settings import GuardSettings
-from dvrk_drake.systems.lcm.lcm_network import usable_lcm_url
+from dvrk_drake.systems.lcm.messages import usable_lcm_url
 from dvrk_drake.systems.ros.discovery import find_topic
 from dvrk_drake.systems.ros.open_domain import open_ros_domain
 
@@ -73,7 +73,7 @@ class ArmConnection(ArmSession):
                     yield observe(link, seconds, self.options)
             return
         with closing(self._observer()) as observer:
-            from dvrk_drake.processes.ros_operator import observe_dvrk
+            from dvrk_drake.processes.arm_operator import observe_dvrk
 
             while not self.dialog.stopped():
                 yield observe_dvrk(observer, seconds, self.options)
@@ -112,7 +112,7 @@ class ArmConnection(ArmSession):
                 after = stop_arm(link, power_off=power_off)
             return describe_state(after.guard_state, after.fault_text)
         with closing(self._observer()) as observer:
-            from dvrk_drake.processes.ros_operator import stop_dvrk
+            from dvrk_drake.processes.arm_operator import stop_dvrk
 
             return stop_dvrk(observer, power_off=power_off)
 

@@ -13,7 +13,7 @@ from dvrk_drake.models.lcm_messages import decode, describe_state, force_channel
 from dvrk_drake.systems.arm_view.arm_view import ArmView
 from dvrk_drake.systems.arm_view.efforts import DrawnForce
 from dvrk_drake.systems.lcm.arm_link import ArmLink
-from dvrk_drake.systems.lcm.lcm_network import handle_message
+from dvrk_drake.systems.lcm.messages import handle_message
 
 #: Longest time to wait for a status [s]. It is short, so that the view can be closed at any time.
 _TIMEOUT = 0.2

@@ -21,7 +21,7 @@ from dvrk_drake.recordings.writer_stream import (
     check_stream_output,
     open_recording_file,
 )
-from dvrk_drake.systems.lcm.lcm_network import handle_message
+from dvrk_drake.systems.lcm.messages import handle_message
 
 #: Longest time until the first status [s]. Time without a status after which the status line reports missing statuses
 #: [s].

@@ -16,8 +16,7 @@ from dvrk_drake.dynamics.holding_torque import HoldingArrays
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ControllerError
 from dvrk_drake.models.arm_schema import Gains
-from dvrk_drake.systems.gravity_pid_step import controller_step
-from dvrk_drake.systems.virtual_friction import FILTER_TIME, NUM_STATES, RATE_TIME
+from dvrk_drake.systems.gravity_pid_step import FILTER_TIME, NUM_STATES, RATE_TIME, controller_step
 
 #: "hold" regulates a pose, "gravity" compensates gravity and leaves the arm free to move, "damped" adds damping, and
 #: "guide" adds virtual dry friction, so the arm stays where a hand leaves it.

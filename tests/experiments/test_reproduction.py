@@ -12,7 +12,7 @@ from figure_rules import checked_figures
 from paper_regressor import paper_regressor
 
 from dvrk_drake.cli import main
-from dvrk_drake.cli.demo import reproduce as command
+from dvrk_drake.cli.simulate import reproduce as command
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import DvrkDrakeError, RecordingError
 from dvrk_drake.experiments.ground_truth import perturbed_arm

@@ -16,9 +16,8 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes.arm_controller import ArmController
-from dvrk_drake.processes.arm_operator import observe, reset_fault, stop_arm
+from dvrk_drake.processes.arm_operator import observe, observe_dvrk, reset_fault, stop_arm, stop_dvrk
 from dvrk_drake.processes.control import first_status
-from dvrk_drake.processes.ros_operator import observe_dvrk, stop_dvrk
 from dvrk_drake.reports.arm_status import status_page
 from dvrk_drake.systems.ros.crtk_client import CrtkObserver, JointMeasurement
 

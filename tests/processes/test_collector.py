@@ -16,7 +16,7 @@ from dvrk_drake.errors import CollectionError, DvrkDrakeError, RecordingError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes.collector import CollectionSettings
-from dvrk_drake.processes.live_status import AnswerTimes, takeover_reason
+from dvrk_drake.processes.control import AnswerTimes, takeover_reason
 from dvrk_drake.processes.teacher import EnterKey, Teacher
 from dvrk_drake.recordings.reading import read_recording
 

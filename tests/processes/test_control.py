@@ -19,8 +19,7 @@ from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.arm_operator import reset_fault
 from dvrk_drake.processes.arm_session import Dialog
 from dvrk_drake.processes.connection import connect
-from dvrk_drake.processes.control import control, first_status
-from dvrk_drake.processes.live_status import LiveStatus, LiveStatusMaker
+from dvrk_drake.processes.control import LiveStatus, LiveStatusMaker, control, first_status
 from dvrk_drake.systems.lcm.arm_link import LcmArmLink
 
 

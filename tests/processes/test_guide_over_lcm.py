@@ -11,7 +11,7 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.models.lcm_messages import command_channel, status_channel
 from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.systems.lcm.arm_link import LcmArmLink
-from dvrk_drake.systems.lcm.lcm_network import handle_message, usable_lcm_url
+from dvrk_drake.systems.lcm.messages import handle_message, usable_lcm_url
 
 pytestmark = pytest.mark.network
 

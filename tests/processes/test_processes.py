@@ -22,10 +22,10 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes import pace
 from dvrk_drake.processes.arm_controller import ArmController
-from dvrk_drake.processes.live_status import LiveLine
+from dvrk_drake.processes.control import LiveLine
 from dvrk_drake.processes.simulated_arm import SimulatedArm, load_driver, start_pose, stop_on_signals
 from dvrk_drake.systems.driver import DvrkDriver
-from dvrk_drake.systems.lcm.lcm_network import usable_lcm_url
+from dvrk_drake.systems.lcm.messages import usable_lcm_url
 from dvrk_drake.systems.lcm.sim_dvrk_driver import DvrkArmServer
 
 
@@ -151,13 +151,13 @@ class LossyLcm(lcm.LCM):
 
 
 def test_network_with_lost_messages_is_usable(monkeypatch):
-    monkeypatch.setattr("dvrk_drake.systems.lcm.lcm_network.lcm.LCM", LossyLcm)
+    monkeypatch.setattr("dvrk_drake.systems.lcm.messages.lcm.LCM", LossyLcm)
     assert usable_lcm_url("memq://") == "memq://"
     assert LossyLcm.lost == 2
 
 
 def test_network_without_route_is_an_error():
-    code = "from dvrk_drake.systems.lcm.lcm_network import usable_lcm_url; usable_lcm_url()"
+    code = "from dvrk_drake.systems.lcm.messages import usable_lcm_url; usable_lcm_url()"
     try:
         done = subprocess.run(
             ["unshare", "-rn", sys.executable, "-c", code], capture_output=True, text=True, timeout=TIMEOUT, check=False

@@ -6,7 +6,7 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.systems.guard.command_guard import CommandGuard
-from dvrk_drake.systems.guard.monitors import PeriodMonitor
+from dvrk_drake.systems.guard.measurement import PeriodMonitor
 from dvrk_drake.systems.guard.plausibility import Plausibility
 
 ARM = load_arm("mtml")

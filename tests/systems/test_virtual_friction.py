@@ -14,7 +14,7 @@ from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.arm_schema import Gains
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
-from dvrk_drake.systems.virtual_friction import (
+from dvrk_drake.systems.gravity_pid_step import (
     DECAY_TIME,
     NUM_STATES,
     PLAY_START,

@@ -21,11 +21,8 @@ from dvrk_drake.systems.guard.command_stream import (
     content_refusal,
     foreign_refusal,
 )
-from dvrk_drake.systems.guard.follower import Follower, GuardOutput
-from dvrk_drake.systems.guard.limits import ArmModel, GuardLimits, Vector
-from dvrk_drake.systems.guard.measurement import Measurement
-from dvrk_drake.systems.guard.monitors import AgeMonitor, OscillationMonitor, PeriodMonitor
-from dvrk_drake.systems.guard.part import Part
+from dvrk_drake.systems.guard.limits import ArmModel, Follower, GuardLimits, GuardOutput, Part, Vector
+from dvrk_drake.systems.guard.measurement import AgeMonitor, Measurement, OscillationMonitor, PeriodMonitor
 from dvrk_drake.systems.guard.plausibility import Plausibility
 from dvrk_drake.systems.guard.settings import GuardSettings
 from dvrk_drake.systems.guard.states import TRANSITIONS, Event, State

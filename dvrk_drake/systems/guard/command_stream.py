@@ -9,9 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command, lcmt_dvrk_status
-from dvrk_drake.models.arm_schema import IMPLAUSIBLE
-from dvrk_drake.systems.guard.limits import Vector
-from dvrk_drake.systems.guard.part import Part
+from dvrk_drake.systems.guard.limits import Part, Vector, is_finite
 
 #: Refusal reasons for messages that do not belong to the session or to the sender in control. The guard counts these
 #: messages as ignored, not as refused.
@@ -38,14 +36,6 @@ OUT_OF_STREAM = frozenset(
         lcmt_dvrk_status.REFUSAL_CLOCK_JUMP,
     }
 )
-
-
-def is_finite(numbers: list[float]) -> bool:
-    """Returns whether all numbers are finite and the sum of their magnitudes is below 1e6.
-
-    The argument is a list, because numpy is slower for a few numbers and warns of an overflow.
-    """
-    return sum(map(abs, numbers)) < IMPLAUSIBLE
 
 
 def foreign_refusal(command: lcmt_dvrk_command | None, arm_name: str, num_joints: int, session_id: int) -> int:

@@ -58,7 +58,7 @@ class PlausibilitySettings:
         frozen_speed: Lowest expected speed of a moving joint [rad/s, m/s]. The time in which a joint moves by one
             encoder count at this speed is added to `frozen_time`.
         response: Allowed unexplained effort as a fraction of the effort limit, in addition to `hand_effort`. See
-            `check_effort.Response`.
+            `plausibility.Response`.
         opposed_effort: Allowed effort against which a joint accelerates, as a fraction of the effort limit. The public
             recordings of real arms have at most 0.06.
         hand_effort: Allowed effort of the operator's hand or of a model error on a joint [N m]. For a prismatic joint,
@@ -147,7 +147,7 @@ class GuardSettings:
         slow_period: Largest allowed median of the last 100 periods between two steps of the guard [s].
         longest_period: Largest allowed time between two steps of the guard [s].
         oscillation: Threshold of the alternating part of the commanded effort for a reversal, as a fraction of the
-            effort limit. See `monitors.OscillationMonitor`.
+            effort limit. See `measurement.OscillationMonitor`.
         oscillation_reversals: Allowed number of reversals. The count decays exponentially.
         oscillation_time: Time constant with which the count of reversals decays [s].
         resume_automatically: If true, commands may act again after a watchdog hold without a resume by an operator.

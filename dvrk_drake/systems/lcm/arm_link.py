@@ -19,7 +19,7 @@ from dvrk_drake.models.lcm_messages import (
     force_channel,
     status_channel,
 )
-from dvrk_drake.systems.lcm.lcm_network import handle_message
+from dvrk_drake.systems.lcm.messages import handle_message
 
 #: Length of the queue of statuses. If the queue is full, further statuses are dropped. Largest number of statuses that
 #: are processed at once. It limits the delay that a flood of messages can cause.

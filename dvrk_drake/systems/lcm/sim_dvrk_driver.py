@@ -18,9 +18,8 @@ from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.driver import DvrkDriver
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 from dvrk_drake.systems.guard.command_guard import CommandGuard
-from dvrk_drake.systems.guard.command_inbox import CommandInbox
-from dvrk_drake.systems.guard.command_stream import is_finite
-from dvrk_drake.systems.lcm.messages import draw_id, fill_in_guard
+from dvrk_drake.systems.guard.limits import is_finite
+from dvrk_drake.systems.lcm.messages import CommandInbox, draw_id, fill_in_guard
 
 #: Shortest time [s] in which an effort grows from zero to its limit, outside the state EFFORT. The gains of the
 #: position controller are stable up to a delay of 8 ms, so the crossover frequency is below pi/2 / 8 ms = 196 rad/s. An

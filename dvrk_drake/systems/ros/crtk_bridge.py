@@ -14,9 +14,8 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import describe_state
 from dvrk_drake.systems.driver import ArmDriver
 from dvrk_drake.systems.guard.command_guard import CommandGuard
-from dvrk_drake.systems.guard.command_inbox import CommandInbox
-from dvrk_drake.systems.guard.follower import GuardOutput
-from dvrk_drake.systems.lcm.messages import draw_id, fill_in_guard
+from dvrk_drake.systems.guard.limits import GuardOutput
+from dvrk_drake.systems.lcm.messages import CommandInbox, draw_id, fill_in_guard
 from dvrk_drake.systems.ros.crtk_client import ArrivalClock, CrtkClient, connect_client
 from dvrk_drake.systems.ros.deadman import DeadmanProcess, describe_priority
 from dvrk_drake.systems.ros.discovery import END_OTHER_PROCESS

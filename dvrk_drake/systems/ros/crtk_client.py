@@ -17,15 +17,13 @@ from numpy.typing import ArrayLike, NDArray
 from dvrk_drake.errors import ControllerError, DvrkDrakeError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.systems.ros.deadman import repeat_until_confirmed
-from dvrk_drake.systems.ros.discovery import END_OTHER_PROCESS, find_topic, wait_unless_stopped
+from dvrk_drake.systems.ros.discovery import END_OTHER_PROCESS, find_topic, shown, wait_unless_stopped
 from dvrk_drake.systems.ros.domain import Publisher, RosDomain, Subscription
 from dvrk_drake.systems.ros.messages import Bool, Empty, Header, JointState, OperatingState, StringStamped
 
 #: Time [s] and number of measurements of the arm after which a measurement of the separate joint is out of date. It is
 #: out of date if both are exceeded, because a dVRK publishes at 100 Hz by default, and not in real time.
 _JAW_AGE, _JAW_COUNT = 0.02, 2
-#: Largest number of characters of a received text that is shown.
-_SHOWN = 40
 
 
 @dataclass(frozen=True)
@@ -132,11 +130,6 @@ class JointStateReader:
             return f"no valid message on {self._topic.rpartition('/')[0]}/{name}/measured_js"
         blocks[:, self._arm.joint_names.index(name)] = self._jaw
         return ""
-
-
-def shown(text: str) -> str:
-    """Returns a received text for a message: on one line and with a limited length."""
-    return text if text.isprintable() and len(text) <= _SHOWN else repr(text[:_SHOWN])
 
 
 #: Number of measurements whose rate is determined.

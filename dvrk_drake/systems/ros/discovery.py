@@ -23,7 +23,14 @@ END_OTHER_PROCESS = "End it. A killed process is listed for up to 10 s"
 #: Longest time to wait for the topic of an arm [s]. Time after which the search is reported [s]. Time to wait for other
 #: topics of the domain after the first one [s].
 _DISCOVERY, _NOTICE, _OTHERS = 10.0, 1.0, 1.0
+#: Largest number of characters of a received text that is shown.
+_SHOWN = 40
 _NAME = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*/?")
+
+
+def shown(text: str) -> str:
+    """Returns a received text for a message: on one line and with a limited length."""
+    return text if text.isprintable() and len(text) <= _SHOWN else repr(text[:_SHOWN])
 
 
 def topic_fault(name: str) -> str:

@@ -8,7 +8,7 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.lcm_messages import MessageKey
-from dvrk_drake.systems.guard.command_inbox import CommandInbox
+from dvrk_drake.systems.lcm.messages import CommandInbox
 
 KEY = MessageKey(bytes(range(32)))
 #: Number of messages above the capacity of an inbox.

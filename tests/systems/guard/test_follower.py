@@ -6,8 +6,7 @@ from guard_bench import ARM, LIMIT, Inert, N, Q
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
-from dvrk_drake.systems.guard.follower import Follower
-from dvrk_drake.systems.guard.limits import GuardLimits
+from dvrk_drake.systems.guard.limits import Follower, GuardLimits
 from dvrk_drake.systems.guard.settings import GuardSettings
 
 LIMITS = GuardLimits(ARM, GuardSettings(following_time=0.1))

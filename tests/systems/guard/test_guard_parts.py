@@ -12,9 +12,10 @@ from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.ranges import RANGE
-from dvrk_drake.processes.live_status import LiveStatusMaker
+from dvrk_drake.processes.control import LiveStatusMaker
 from dvrk_drake.systems.driver import DvrkDriver
-from dvrk_drake.systems.guard.command_stream import CommandStream, is_finite
+from dvrk_drake.systems.guard.command_stream import CommandStream
+from dvrk_drake.systems.guard.limits import is_finite
 from dvrk_drake.systems.guard.measurement import Measurement
 from dvrk_drake.systems.guard.settings import _WEAKER_IF_SMALLER as WEAKER_IF_SMALLER
 from dvrk_drake.systems.guard.settings import GuardSettings, PlausibilitySettings

@@ -11,8 +11,7 @@ from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.arm_schema import CoupledLimit
-from dvrk_drake.systems.guard.follower import Follower
-from dvrk_drake.systems.guard.limits import SAFE_DELAY, GuardLimits
+from dvrk_drake.systems.guard.limits import SAFE_DELAY, Follower, GuardLimits
 from dvrk_drake.systems.guard.settings import GuardSettings
 
 A, LOWER, UPPER = ARM.limit_matrix()

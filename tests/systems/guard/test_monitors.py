@@ -6,7 +6,7 @@ from guard_bench import ARM, LIMIT, MS, Bench, N, Q, modes
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
-from dvrk_drake.systems.guard.monitors import OscillationMonitor, PeriodMonitor
+from dvrk_drake.systems.guard.measurement import OscillationMonitor, PeriodMonitor
 from dvrk_drake.systems.guard.settings import GuardSettings
 
 SETTINGS = GuardSettings()
