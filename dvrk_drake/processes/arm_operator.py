@@ -269,7 +269,8 @@ def observe_dvrk(observer: CrtkObserver, seconds: float, options: str) -> ArmObs
         seconds: Duration [s].
         options: Options of a command line for this arm, for the next step.
     """
-    domain, arm, received = observer.domain, observer.arm, list[JointMeasurement]()
+    domain, arm = observer.domain, observer.arm
+    received: list[JointMeasurement] = []
     num_before, start = observer.num_received, time.monotonic()
 
     def receive() -> bool:
