@@ -246,17 +246,3 @@ def test_changed_arm_file_is_read_again(tmp_path):
     assert dvrk.load_arm(str(path)) is first
     path.write_text(text.replace("MTMR", "OTHER"))
     assert (first.name, dvrk.load_arm(path).name) == ("MTMR", "OTHER")
-
-
-def test_verdicts_do_not_replace_other_files(identified_poses, tmp_path):
-    recording, result = identified_poses.recording, identified_poses.result
-    own, other = tmp_path / "own.yaml", tmp_path / "other.csv"
-    result.save(own)
-    other.write_text("mine")
-    validation = dvrk.validate(result.model, dataclasses.replace(identified_poses.other, source="others.csv"))
-    assert_refused(DvrkDrakeError, "already exists", validation.save, other)
-    assert other.read_text() == "mine"
-    validation.save(own)
-    assert dvrk.IdentifiedModel.load(own).validation.recording == "others.csv"
-    assert repr(result).startswith("<StaticIdentification of MTMR: ")
-    assert "poses.csv: 40 rows, 7 joints, joint coordinates" in repr(recording)

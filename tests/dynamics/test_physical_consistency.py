@@ -108,19 +108,6 @@ def test_inconsistent_parameters_become_consistent_at_least_cost(links, boxes, n
         assert cost(x + 1e-3 * (other - x)) >= cost(x) - 1e-4
 
 
-def test_links_without_data_keep_the_parameters_of_the_sdf(links, boxes, nominal, scale):
-    """The Gaussian prior is weak, so the log-det prior determines these links. Both have their minimum at the SDF."""
-    weak = 1e-2 / scale
-    row = np.zeros(len(nominal))
-    row[:10] = 1 / scale[:10]
-    stacked = np.vstack([np.diag(weak), 100 * row])
-    target = np.append(weak * nominal, 100 * (row @ nominal + 0.2))
-    R = np.linalg.qr(stacked, mode="r")
-    x = solve(links, boxes, R, np.linalg.solve(R.T, stacked.T @ target))
-    assert row @ (x - nominal) == pytest.approx(0.2, abs=0.01)
-    assert np.max(np.abs(x - nominal)[10:] / scale[10:]) < 1e-3
-
-
 def test_priors_determine_directions_without_data(links, boxes, nominal, scale):
     """The gradient of the priors vanishes in directions that the data do not determine."""
     generator = np.random.default_rng(3)

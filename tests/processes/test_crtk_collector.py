@@ -13,7 +13,6 @@ from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes.arm_controller import GoalController, MotionStyle
 from dvrk_drake.processes.collector import DELAY, CollectionSettings, Collector, approaches, estimated_duration, summary
 from dvrk_drake.processes.ros_recorder import bag_path
-from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.systems.ros.crtk_link import GOAL_PERIOD, CrtkMoveLink
 
 #: Interval of the measurements [s].
@@ -169,19 +168,6 @@ def in_motion(collection):
     return lambda: len(collection.arm.goals) > 3
 
 
-def test_friction_cancels_in_rows(collection, tmp_path):
-    collector = collection.run()
-    assert collector.problem is None and collector.done.all() and not collector.unsettled
-    recording = read_recording(tmp_path / "p.csv")
-    np.testing.assert_allclose(recording.q, POSES, rtol=0, atol=1e-12)
-    gravity = [collection.arm.model.gravity_effort(q) for q in POSES]
-    np.testing.assert_allclose(recording.tau, gravity, rtol=0, atol=1e-12)
-    cells = (tmp_path / "p.csv").read_text().splitlines()
-    friction = np.array([row.split(",")[-7:] for row in cells[1:]], float)
-    np.testing.assert_allclose(friction, [0.1 * MTML.effort_limits] * 2, rtol=0, atol=1e-12)
-    assert collection.arm.commands == ["move_jp", "hold"]
-
-
 def test_goals_advance_slowly_on_a_line(collection):
     collection.run()
     goals = np.array(collection.arm.goals)
@@ -208,14 +194,6 @@ def test_pause_holds_and_repeats_the_pose(collection):
     assert collection.run().done.all() and not collection.collector.paused
     assert arm.commands == ["move_jp", "hold", "move_jp", "hold"]
     assert collection.lines[:2] == ["paused: the arm holds its pose; Enter continues", "continued"]
-
-
-def test_repeated_enter_does_not_continue(collection):
-    collection.run(in_motion(collection))
-    collection.keys = 10
-    end = collection.arm.time + 0.9
-    collection.run(lambda: collection.arm.time > end)
-    assert collection.collector.paused
 
 
 def disturb(arm, **changes):

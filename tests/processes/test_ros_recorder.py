@@ -125,17 +125,6 @@ def test_clock_that_is_set_back_is_no_gap():
     assert (missing.count, missing.longest) == (0, pytest.approx(1e-3, abs=1e-9))
 
 
-@pytest.mark.parametrize("publisher", ["reliable"], indirect=True)
-def test_messages_name_the_topics_that_exist(publisher, tmp_path, monkeypatch):
-    monkeypatch.setattr(discovery, "_DISCOVERY", 1.5)
-    found = r"Topics with JointState messages: /dvrk/PSM1/jaw/measured_js, /dvrk/PSM1/measured_js\."
-    for arm, topic, problem in (("mtml", None, "has no topic /MTML/measured_js"), ("psm", "/PSM3", "topic /PSM3")):
-        recorder = RosRecorder(load_arm(arm), tmp_path / "a.mcap", topic, publisher)
-        with pytest.raises(RecordingError, match=rf"ROS domain {publisher}: .*{problem}\. {found}"):
-            recorder.run(1.0, lambda: False, lambda text: None)
-    assert list(tmp_path.iterdir()) == []
-
-
 def message(k, joints=slice(0, 6), names=JOINTS, stamp=None):
     """Returns message k of `ros_publisher` and its time of publication."""
     stamp = START + k * PERIOD if stamp is None else stamp

@@ -30,17 +30,18 @@ LONGEST = 20.0
 
 
 @contextlib.contextmanager
-def start_simulated_arm(arm, name, rate=RATE):
+def start_simulated_arm(arm, name, rate=RATE, *options):
     """Context in which a simulated arm runs. It is in the state DISABLED.
 
     Args:
         arm: Name of the arm for --arm, e.g. "mtml".
         name: Name of the arm in its topics, e.g. "MTML".
         rate: Rate of the measurements [Hz].
+        options: Further options of `sim-arm`.
     """
     from dvrk_drake.systems.ros.domain import RosDomain
 
-    process = dvrk_drake("sim-arm", "--arm", arm, "--transport", "ros", "--rate", rate)
+    process = dvrk_drake("sim-arm", "--arm", arm, "--transport", "ros", "--rate", rate, *options)
     subject = Console(name, process, process.pid, Path(os.devnull), RosDomain(0))
     try:
         wait_until(subject.state, "operating state", process)

@@ -94,6 +94,8 @@ class Console:
         wait_until(lambda: self.state() == ("ENABLED", False, False), "enabled", self.process)
         self.state_command("home")
         wait_until(lambda: self.state() == ("ENABLED", True, False), "homed", self.process)
+        if self._events == Path(os.devnull):  # a simulated arm
+            return
         wait_until(lambda: "current state HOMED" in " ".join(self.events()), "homed", self.process)
         if self.arm.startswith("PSM"):
             # `run.py` has no instrument: the console asks for its type.

@@ -198,12 +198,6 @@ def test_fault_before_first_pose_outputs_zero():
     np.testing.assert_allclose(bench.step(POSES[0]), MODEL.holding_torque(POSES[0]), atol=1e-12)
 
 
-def test_gravity_mode_ignores_desired_state():
-    bench = Bench(np.full(2 * N, np.nan), mode="gravity")
-    bench.initialize(POSES[0])
-    assert bench.output("fault") == [0.0]
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -256,21 +256,6 @@ def test_jaw_may_press_on_an_object():
     assert q[6] == PSM.position_lower[6]
 
 
-def test_scale_changes_without_a_jump():
-    loop = Loop(scale=0.2)
-    loop.step(engaged=1.0)
-    held = loop.move(Q_M + 0.1)[-1]
-    loop.system.SetScale(loop.context, 0.6)
-    q, _ = loop.step()
-    np.testing.assert_allclose(q, held, atol=1e-12)
-    q = loop.move(Q_M + 0.12)[-1]
-    np.testing.assert_allclose(
-        tip(q).translation() - tip(held).translation(),
-        0.6 * (handle(Q_M + 0.12).translation() - handle(Q_M + 0.1).translation()),
-        atol=1e-9,
-    )
-
-
 @pytest.mark.parametrize("scale", [0.0, -0.3, 1.1, np.nan])
 def test_scale_out_of_range_is_refused(scale):
     assert_refused(ControllerError, "scale must be above 0 and at most 1", Teleoperation, MTM, PSM, scale=scale)

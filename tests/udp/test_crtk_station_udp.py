@@ -42,9 +42,7 @@ def test_diagram_controls_an_arm_with_efforts(tmp_path, monkeypatch):
     path.write_text(yaml.safe_dump({"arms": {"mtml": {"arm": "mtml", "ros_driver": {"guard": guard}}}}))
     config = load_station_config(path)
     with start_simulated_arm("mtml", "MTML", 500.0) as arm:
-        for word, homed in (("enable", False), ("home", True)):
-            arm.state_command(word)
-            assert arm.domain.wait_until(lambda goal=("ENABLED", homed, False): arm.state() == goal, 20.0)
+        arm.enable_and_home()
         before = np.array(arm.latest().position)
         efforts = arm.domain.subscribe("/MTML/servo_jf", JointState)
         holds = arm.domain.subscribe("/MTML/hold", Empty)
@@ -74,9 +72,7 @@ def test_later_station_of_a_process_replaces_an_earlier_one(tmp_path, monkeypatc
     path.write_text(yaml.safe_dump({"arms": {"mtml": {"arm": "mtml", "ros_driver": {}}}}))
     config, simulators = load_station_config(path), []
     with start_simulated_arm("mtml", "MTML", 500.0) as arm:
-        for word, homed in (("enable", False), ("home", True)):
-            arm.state_command(word)
-            assert arm.domain.wait_until(lambda goal=("ENABLED", homed, False): arm.state() == goal, 20.0)
+        arm.enable_and_home()
         for _ in range(3):
             station = Station(config, hardware=True)
             simulators.append(Simulator(station))

@@ -54,14 +54,6 @@ def test_names_the_unit_of_wrong_times(unit, factor, rate):
         assert_refused(RecordingError, f"t may be in {unit}", call)
 
 
-def test_finds_the_unit_of_times_of_one_moving_joint():
-    whole = motion(velocities=True)
-    still = np.where(np.arange(7) == 1, 1.0, 0.0)
-    one = replace(whole, q=whole.q * still + 0.1 * (1 - still), qd=whole.qd * still, t=1e3 * whole.t)
-    (refusal,) = check_recording(Observations(one, ARM)).refusals
-    assert "t may be in milliseconds: 100 Hz" in refusal.what
-
-
 @pytest.mark.parametrize("names", [("tau", "qd", "q"), ("q", "tau", "qd"), ("qd", "q", "tau")])
 def test_names_of_exchanged_quantities(names):
     true = motion(velocities=True)

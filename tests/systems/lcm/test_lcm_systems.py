@@ -280,26 +280,6 @@ def test_ports_tell_the_state_and_a_reset_resumes():
     assert state()[:4] == [Status.STATE_FAULT, Status.FAULT_DRIVER, Command.HOLD, 0]
 
 
-def test_hardware_station_ignores_old_statuses():
-    lcm = DrakeLcm("memq://")
-    arm, controller = SimulatedArm(lcm), Controller(lcm)
-    old = []
-    lcm.Subscribe("DVRK_STATUS_MTML", old.append)
-    run(lcm, 400, arm, controller)
-    past = Status.decode(old[100])
-    past.position = [9.0] * ARM.num_joints
-    station = controller.simulator.get_system().GetSubsystemByName("mtml_station")
-    for _ in range(20):
-        arm.step()
-        lcm.Publish("DVRK_STATUS_MTML", past.encode())
-        lcm.HandleSubscriptions(0)
-        controller.step()
-        q = station.GetOutputPort("mtml.position_measured").Eval(
-            station.GetMyContextFromRoot(controller.simulator.get_context())
-        )
-        np.testing.assert_allclose(q, POSES["mtml"], atol=1e-3)
-
-
 def test_messages_require_the_same_key(tmp_path):
     create_key_file(tmp_path / "a.key")
     lcm, driver = DrakeLcm("memq://"), DvrkDriver(key_file=str(tmp_path / "a.key"))

@@ -116,21 +116,6 @@ def test_efforts_act_on_the_arm(name):
     assert simulated.q[0] > q[0] + 1e-3
 
 
-def test_jaw_has_a_control_mode_of_its_own():
-    simulated = Simulated("psm")
-    q = simulated.home()
-    simulated.send("use_gravity_compensation", is_on=True)
-    simulated.send("jaw/servo_jf", [0.05], seconds=0.5)
-    assert simulated.q[6] > q[6] + 0.1
-    np.testing.assert_allclose(simulated.q[:6], q[:6], rtol=0, atol=0.02)
-    simulated.send("jaw/servo_jp", [0.1], seconds=0.5)
-    np.testing.assert_allclose(simulated.q[6], 0.1, rtol=0, atol=0.02)
-    assert simulated.lines[-2:] == [
-        "ENABLED, homed, control mode position, jaw effort, gravity compensation on",
-        "ENABLED, homed, control mode position, gravity compensation on",
-    ]
-
-
 @pytest.mark.parametrize("name", POSES)
 def test_servo_cp_moves_the_last_frame(name):
     simulated = Simulated(name)
