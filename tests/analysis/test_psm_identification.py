@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from command_output import refused
 
 from dvrk_drake.analysis.pose_identification import identify_static
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
@@ -12,8 +11,6 @@ from dvrk_drake.experiments.ground_truth import perturbed_arm, simulate_poses
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import ArmEffects, DriveEffect
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions, set_joint_damping
-from dvrk_drake.recordings.recording import Recording
-from dvrk_drake.recordings.writing import write_recording
 from dvrk_drake.systems.arm_station import ArmStation
 
 pytestmark = pytest.mark.numeric
@@ -72,23 +69,6 @@ def test_true_torque_is_identified_with_the_closed_linkage(ground_truth_arm, rec
     assert found >= {"joint.yaw offset", "joint.roll cable sine 1"}
     # At a yaw joint the torques of a spring and of a lifted weight are equal. Only one of them may be a candidate.
     assert "joint.yaw cable sine 1" not in found
-
-
-@pytest.mark.parametrize(
-    ("spoil", "message"),
-    [
-        (lambda r: Recording(q=r.q[:, :6], tau=r.tau[:, :6]), "missing column q7; "),
-        (lambda r: Recording(q=r.q * [1, 1, 1000, 1, 1, 1, 1], tau=r.tau), "Are the positions in millimetres"),
-        (lambda r: Recording(q=r.q * [3, 1, 1, 1, 1, 1, 1], tau=r.tau), "yaw (q1) = "),
-        (lambda r: Recording(q=r.q, tau=r.tau + 1000 * np.eye(7)[2]), "insertion (tau3) exceed its limit of 9.88"),
-    ],
-)
-@pytest.mark.slow
-def test_bad_recordings_are_rejected_in_one_line(recording, tmp_path, capsys, spoil, message):
-    path, model = tmp_path / "bad.csv", tmp_path / "model.yaml"
-    write_recording(spoil(recording), path)
-    assert message in refused(capsys, "identify", path, "--arm", "psm", "--output", model)
-    assert not model.exists()
 
 
 def test_prismatic_joint_has_no_angular_spring():

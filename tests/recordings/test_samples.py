@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import importlib.util
-import os
 import re
 
 import numpy as np
 import pytest
-from command_output import assert_refused, refusal
+from command_output import assert_refused
 from forked import public_folder, run_unprivileged
 from repository import ROOT
 
@@ -91,18 +90,6 @@ def test_folder_with_files_is_kept(tmp_path, capsys):
     assert main(["samples", str(tmp_path), "--overwrite"]) == 0
     assert {path.name for path in tmp_path.iterdir()} == FILES and mine.read_text() != "mine"
     assert "dvrk-drake check" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("path", ["file", "file/below"])
-def test_path_without_a_folder_gives_one_line(path, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "file").write_text("mine")
-    assert main(["samples", path]) == 2
-    captured = capsys.readouterr()
-    assert not captured.out and refusal(captured.err)
-    with pytest.raises(dvrk.DvrkDrakeError):
-        dvrk.write_samples(path)
-    assert os.listdir(tmp_path) == ["file"]
 
 
 def test_folder_without_write_permission_is_refused():

@@ -135,11 +135,6 @@ def test_invalid_values_are_reported(path, old, new, message):
     assert_refused((StationError, ArmError), message, load_station_config, path)
 
 
-def test_unknown_word_of_drake_is_reported(path):
-    path.write_text(FILE.replace("point", "glue"))
-    assert_refused(StationError, "plant: Unknown contact_model: 'glue'", Station, load_station_config(path))
-
-
 def test_gravity_of_another_base_is_refused(path):
     path.write_text(FILE.replace("seed: 3", "gravity: [0, 9.81, 0]"))
     with pytest.raises(StationError, match=r"arms\.side: X_PB gives the gravity \[0\.0, -9\.81, 0\.0\] m/s\^2"):

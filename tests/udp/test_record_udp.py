@@ -3,10 +3,8 @@
 The processes of dvrk-drake are forked from one that has imported the package; one test uses the command line.
 """
 
-import contextlib
 import os
 import signal
-import subprocess
 import threading
 from pathlib import Path
 
@@ -14,18 +12,14 @@ import lcm
 import numpy as np
 import pytest
 from arm_processes import PATIENCE, POSES, CommandLine, dvrk_drake, impatient_dvrk_drake, start_arm
-from mcap.exceptions import EndOfFile
-from mcap.records import Message
-from mcap.stream_reader import StreamReader
 from own_network import end, start
 from recordings import csv_block
 from status_logs import ARM, log_bytes, statuses
-from waiting import TIMEOUT, wait_until
+from waiting import wait_until
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.recordings.reader_lcm import measurements, read_events
 from dvrk_drake.recordings.reading import read_recording
-from dvrk_drake.recordings.writer_mcap import CHUNK_TIME
 
 TOOLS = Path(lcm.__file__).parents[1] / "bin"  # the programs themselves: those on the PATH start them as children
 pytestmark = [
@@ -70,10 +64,6 @@ def played(tmp_path_factory):
     path = tmp_path_factory.mktemp("played") / "played.log"
     path.write_bytes(log_bytes(statuses(1000)))
     return path
-
-
-def play(path, *options):
-    subprocess.run([TOOLS / "lcm-logplayer", *options, path], check=True, timeout=TIMEOUT, capture_output=True)
 
 
 def rows_in(path):
@@ -151,34 +141,6 @@ def test_killed_record_or_logger_leaves_readable_file(tmp_path, played):
             if not path.name.endswith("logger.log"):
                 assert not [note for note in recording.notes if "missing in the sequence" not in note]
             assert all(values == original[utime] for utime, values in by_utime(path).items())
-
-
-def measured_in(path):
-    """Returns the number of messages on measured_js in the complete chunks of a bag that may have no end."""
-    count = 0
-    with path.open("rb") as file, contextlib.suppress(EndOfFile):
-        for record in StreamReader(file).records:
-            # The first channel is measured_js.
-            count += isinstance(record, Message) and record.channel_id == 1
-    return count
-
-
-def test_bag_ends_with_index_and_survives_kill(tmp_path, played):
-    paths = [tmp_path / "ended.mcap", tmp_path / "killed.mcap"]
-    recorders = start_records(paths)
-    play(played, "--speed=0.25")
-    original = read_recording(played, ARM)
-    # The last chunk, of 0.1 s, is written at the end.
-    complete = 0.95 * len(original) - 0.25 * CHUNK_TIME / 1e6
-    wait_until(lambda: all(measured_in(path) >= complete for path in paths), "the messages")
-    said = recorders[0].end(signal.SIGTERM)
-    assert recorders[0].wait() == 0, said
-    recorders[1].end(signal.SIGKILL)
-    recording = read_recording(paths[0], ARM)
-    assert len(recording) >= 0.95 * len(original)
-    for name in ("q", "qd", "tau"):
-        assert set(map(tuple, getattr(recording, name))) <= set(map(tuple, getattr(original, name)))
-    assert measured_in(paths[1]) >= complete
 
 
 def test_missing_status_is_explained(tmp_path, played):

@@ -379,37 +379,6 @@ def kinds_of(report):
     return kinds
 
 
-def test_real_mtm(real):
-    report = real("mtm_one")
-    kinds = kinds_of(report)
-    assert report.refusals == ()
-    assert 0.11 <= kinds["repeated rows"][0].size <= 0.135
-    assert "jitter" in kinds
-    assert [f.joints[0] for f in kinds["velocity disagrees"]] == [4, 5, 6]
-    assert all(1.04 <= f.size <= 1.185 for f in kinds["velocity disagrees"])
-    assert max(joint.velocity_lag for joint in report.joints) <= 2.2 / 200
-    assert all(abs(joint.velocity_gain - 1) < 0.014 for joint in report.joints[:4])
-    assert round(report.period * 200) == 2333
-    assert 1 / report.period == pytest.approx(0.1 * 6 / 7, rel=2e-3)
-    np.testing.assert_allclose(
-        [100 * joint.floor for joint in report.joints], [4.5, 15.2, 6.7, 4.3, 16.3, 10.3, 19.2], atol=0.055
-    )
-
-
-def test_real_psm(real):
-    report = real("psm_one")
-    kinds = kinds_of(report)
-    assert report.refusals == ()
-    assert "repeated rows" not in kinds
-    assert "velocity disagrees" not in kinds
-    assert all(abs(joint.velocity_gain - 1) < 0.014 for joint in report.joints)
-    assert round(report.period * 200) == 1296
-    assert 1 / report.period == pytest.approx(0.18 * 6 / 7, rel=2e-3)
-    np.testing.assert_allclose(
-        [100 * joint.floor for joint in report.joints], [1.4, 2.0, 15.3, 3.1, 1.4, 1.9, 2.2], atol=0.055
-    )
-
-
 @pytest.mark.parametrize("name", ["psm_one", "psm_one_no_weight", "psm_one_105g_parallel", "psm_one_205g_insertion"])
 def test_real_insertion_has_noise_and_effort_lag(real, name):
     kinds = kinds_of(real(name))

@@ -8,7 +8,6 @@ import yaml
 
 from dvrk_drake.analysis.excitation.motion_limits import (
     MotionLimits,
-    first_collision,
     motion_violations,
     spectral_derivative,
     tip_positions,
@@ -73,16 +72,6 @@ def test_position_limits_include_those_of_the_user(arm):
     assert line.startswith(f"position of {name} is {q.min():.6g}")
 
 
-def test_coupled_limit_is_checked():
-    arm = load_arm("mtml")
-    (coupled,) = arm.coupled_limits
-    motion = one_joint(arm, 1, 0.7)
-    center = np.array(motion.center)
-    center[1:3] = [0.4, 0.3]
-    lines = motion_violations(replace(motion, center=center.tolist()), arm, LIMITS)
-    assert any(f"position of {coupled.name}" in line for line in lines)
-
-
 def test_tip_stays_in_its_box():
     arm = load_arm("psm")
     motion = one_joint(arm, 0, 0.3)
@@ -101,17 +90,6 @@ def test_table_is_an_obstacle():
     assert motion_violations(motion, arm, replace(LIMITS, environment=Environment(lowest - 0.05))) == []
     (line,) = motion_violations(motion, arm, replace(LIMITS, environment=Environment(lowest + 0.01)))
     assert line.startswith("collision of ") and "the table at" in line
-
-
-def test_first_collision_is_found():
-    arm = load_arm("psm")
-    q = np.tile(arm.sample_poses(1, np.random.default_rng(0)), (5, 1))
-    q[:, 2] = [0.05, 0.1, 0.15, 0.2, 0.24]
-    heights = tip_positions(arm, q)[:, 2]
-    assert np.all(np.diff(heights) < 0)
-    row, what = first_collision(arm, q, Environment(float(heights[3] + heights[2]) / 2))
-    assert row <= 3 and "the table" in what
-    assert first_collision(arm, q) is None
 
 
 @pytest.mark.parametrize(
@@ -159,15 +137,6 @@ def test_functions_of_the_basis_are_independent_and_at_rest():
     assert np.linalg.matrix_rank(values[0]) == values.shape[2] == 2 * HARMONICS - 1
     weights = np.vstack([basis.sines, basis.cosines])
     np.testing.assert_allclose(weights.T @ weights, np.eye(2 * HARMONICS - 2), atol=1e-12)
-
-
-def test_motion_is_the_weighted_sum_of_the_basis():
-    basis, generator = FourierBasis.of(PERIOD, HARMONICS), np.random.default_rng(1)
-    coefficients = generator.normal(size=(ARM.num_joints, 2 * HARMONICS - 1))
-    motion = PeriodicMotion.of_coefficients(ARM, basis, coefficients, 1)
-    t = generator.uniform(0, PERIOD, 20)
-    for found, expected in zip(motion.evaluate(t), basis.values(t) @ coefficients.T, strict=True):
-        np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
 def test_derivatives_match_the_positions(motion):

@@ -65,9 +65,6 @@ class HeldArm:
         self.wanted = RigidTransform(R, self.start.translation() + p)
         self.port.GetMutableData().set_value(self.wanted)
 
-    def let_go(self):
-        self.port.GetMutableData().set_value(RigidTransform(np.full(3, np.nan)))
-
     def advance(self):
         """Advances one step and returns the work of the hand on the arm."""
         port, context = self.effort
@@ -152,16 +149,3 @@ def test_hand_adds_no_energy_beyond_its_work(grip):
     # At first it does not measure what else pushes the arm: by some micrometres, until it pushes back.
     assert worst > -0.5 * held.grip.stiffness * 5e-6**2
     assert taken > 0.3
-
-
-@pytest.mark.parametrize("name", ["mtml", pytest.param("psm", marks=pytest.mark.slow)])
-def test_oscillation_on_cables_and_springs_gains_no_energy(name):
-    held = HeldArm(name, weightless(name).effects.only(["cables", "springs"]), Grip())
-    held.let_go()
-    path = []
-    for _ in range(2000):
-        path.append(held.in_arm())
-        held.advance()
-    # Evaluated at the start of a step, so the energy oscillates by less than 1 %. It does not grow.
-    assert max(path) < path[0] + 0.01 * abs(path[0])
-    assert np.ptp(held.q - middle(held.arm)) > 0.05

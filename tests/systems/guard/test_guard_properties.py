@@ -124,6 +124,15 @@ class Script:
 _PERIODS = [0.5, 0.3, 0.15, 0.01, 0.02, 0.01, 0.01]
 
 
+#: Control modes of the output in each state. In all other states, the arm holds.
+ALLOWED = {
+    Status.STATE_OFF: {Command.OFF},
+    Status.STATE_FAULT: {Command.OFF, Command.HOLD, Command.EFFORT},
+    Status.STATE_POSITION: {Command.POSITION},
+    Status.STATE_EFFORT: {Command.EFFORT},
+}
+
+
 def check(data, modes):
     """Runs a script through a guard and counts the modes of its output."""
     arm, guard = data.draw(configurations())
@@ -138,6 +147,8 @@ def check(data, modes):
     for _ in range(10):
         output = script.step()
         modes[output.control_mode, guard.state] += 1
+        assert output.control_mode in ALLOWED.get(guard.state, {Command.HOLD})
+        assert output.control_mode == Command.EFFORT or not np.any(output.effort)
         for numbers in (output.position, output.velocity, output.effort):
             assert numbers.shape == (script.n,) and np.all(np.isfinite(numbers))
         assert np.all(np.abs(output.effort) <= arm.effort_limits * (1 + 1e-12))
