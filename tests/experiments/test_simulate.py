@@ -11,12 +11,11 @@ from repository import ROOT
 
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.errors import ScenarioError, SimulationError
-from dvrk_drake.experiments.scenario import Scenario, Target, load_scenario
+from dvrk_drake.errors import SimulationError
+from dvrk_drake.experiments.scenario import load_scenario
 from dvrk_drake.experiments.simulation import advance, simulate
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
-from dvrk_drake.models.sdf_model import MODELS_FOLDER
 from dvrk_drake.recordings.reading import read_recording
 
 pytestmark = pytest.mark.drake_api
@@ -111,17 +110,6 @@ def test_gravity_direction_requires_matching_model(tmp_path):
     assert moved[1] > 0.05
 
 
-def test_scenario_gains_are_used():
-    low_gains = "controller.gains={kp: [0.02,0.02,0.5,0.01,0.01,0.01,0.01], kd: [0,0,0,0,0,0,0], ki: [0,0,0,0,0,0,0]}"
-    target = "targets=[{time: 0.5, pose: [0.1,0,0.1,0,0,0,0]}]"
-    moved = []
-    for more in ([], [low_gains]):
-        q = simulate(load_scenario("psm", ["duration=1", f"start={ZERO}", target, *more])).recording.q
-        moved.append(q[-1, 0])
-    assert moved[0] == pytest.approx(0.1, abs=2e-3)
-    assert abs(moved[1]) < 0.02
-
-
 def test_other_commands_read_the_recording(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "160")  # headings on one line
     model, recording, errors = (str(tmp_path / name) for name in ("model.yaml", "held.csv", "errors.json"))
@@ -162,21 +150,6 @@ def test_invalid_settings_give_one_line_error(setting, message, capsys, tmp_path
     output = tmp_path / "out.csv"
     assert message in refused(capsys, "simulate", "--arm", "psm", "--set", setting, "--output", output)
     assert not output.exists()
-
-
-def test_simulates_arm_from_file(tmp_path):
-    path = tmp_path / "ours.yaml"
-    path.write_text((MODELS_FOLDER / "arms/mtml.yaml").read_text().replace("name: MTML", "name: OURS"))
-    scenario = load_scenario(str(path), ["duration=0.02"])
-    assert scenario.mounted_arm.name == "OURS"
-    assert main(["simulate", "--arm", str(path), "--set", "duration=0.02"]) == 0
-
-
-def test_targets_require_mode_hold():
-    scenario = Scenario(arm="psm", targets=[Target(1.0, [0, 0, 0.1, 0, 0, 0, 0])])
-    scenario.check()
-    scenario.controller.mode = "gravity"
-    assert_refused(ScenarioError, r'targets require controller\.mode "hold"', scenario.check)
 
 
 class Failing(LeafSystem):
