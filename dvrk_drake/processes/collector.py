@@ -21,7 +21,7 @@ from dvrk_drake.processes.arm_controller import ArmController, GoalController, M
 from dvrk_drake.processes.arm_mover import REST_TIME, SETTLE, ArmMover, Steps
 from dvrk_drake.processes.arm_session import ArmSession
 from dvrk_drake.processes.control import SILENCE
-from dvrk_drake.processes.ros_recorder import RosRecorder, bag_path
+from dvrk_drake.processes.recorder import RosRecorder, bag_path
 from dvrk_drake.systems.cubic_trajectory import CubicTrajectory
 from dvrk_drake.systems.lcm.arm_link import ArmLink
 from dvrk_drake.systems.ros.open_domain import open_ros_domain

@@ -22,8 +22,7 @@ from dvrk_drake.processes.collector import CollectionSettings, Collector, collec
 from dvrk_drake.processes.control import LiveStatus
 from dvrk_drake.processes.force_monitor import ForceMonitor
 from dvrk_drake.processes.motion_player import PlayedMotion, play_motion
-from dvrk_drake.processes.recorder import ArmRecorder, LcmRecorder
-from dvrk_drake.processes.ros_recorder import RosRecorder
+from dvrk_drake.processes.recorder import ArmRecorder, LcmRecorder, RosRecorder
 from dvrk_drake.processes.teacher import teach_poses
 from dvrk_drake.recordings.writer_stream import check_stream_output
 from dvrk_drake.systems.friction_compensator import FrictionCompensator

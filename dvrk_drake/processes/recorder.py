@@ -1,12 +1,16 @@
-"""Recorders of the measurements of one arm, started by `dvrk-drake record`: common part, and statuses over LCM."""
+"""Recorders of the measurements of one arm over LCM or ROS 2, started by `dvrk-drake record`."""
 
 from __future__ import annotations
 
+import os
 import time
 from abc import ABC, abstractmethod
+from array import array
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import lcm
 import numpy as np
@@ -15,97 +19,53 @@ from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.lcm_messages import STATUS_PREFIX, MessageKey, StatusFilter, describe_state, status_channel
 from dvrk_drake.recordings.reader_lcm import StatusStream
-from dvrk_drake.recordings.writer_mcap import GrowingMcap
+from dvrk_drake.recordings.reader_rosbag import JOINT_STATE
+from dvrk_drake.recordings.writer_mcap import FrameMessages, GrowingMcap, Topic, joint_state_topics
 from dvrk_drake.recordings.writer_stream import (
     RecordingFile,
     check_stream_output,
     open_recording_file,
 )
 from dvrk_drake.systems.lcm.messages import handle_message
+from dvrk_drake.systems.ros.discovery import find_topic
+from dvrk_drake.systems.ros.open_domain import open_ros_domain
+
+if TYPE_CHECKING:
+    from dvrk_drake.systems.ros.domain import RosDomain, Subscription
+    from dvrk_drake.systems.ros.messages import JointState
 
 #: Longest time until the first status [s]. Time without a status after which the status line reports missing statuses
 #: [s].
 FIRST_STATUS, SILENCE = 10.0, 0.5
 #: Time without a status of the session after which the statuses of a new session are recorded [s].
 _RESTART = 1.0
-#: Length of the queue of messages. If it is full, further messages are lost.
-_QUEUE = 20_000
+#: Length of the queue of messages over LCM, and number of messages of one ROS topic that may arrive while the recorder
+#: writes. If it is exceeded, messages are lost.
+_QUEUE, _DEPTH = 20_000, 5000
 #: Reasons why messages do not belong to the arm's session.
 _FOREIGN = (StatusFilter.OTHER_SESSION, StatusFilter.JUMP, StatusFilter.NOT_AUTHENTIC)
-#: Number of messages whose median period is used, and number of intervals that are compared with it at once.
-_PERIOD_WINDOW, _CHECKED_INTERVALS = 100, 20
 #: Longest wait for a message between two checks for a stop [s].
 _POLL = 0.1
 
 
-class Rate:
-    """Number of messages in the last second."""
-
-    def __init__(self) -> None:
-        """Creates a counter without messages."""
-        self._arrivals: deque[float] = deque()
-
-    def add(self, now: float) -> None:
-        """Counts a message that arrives at the time `now` [s]."""
-        self._arrivals.append(now)
-
-    def per_second(self, now: float) -> int | None:
-        """Returns the number of messages since `now` - 1 s, or None if the last message is older than `SILENCE`."""
-        while self._arrivals and self._arrivals[0] < now - 1:
-            self._arrivals.popleft()
-        return len(self._arrivals) if self._arrivals and self._arrivals[-1] >= now - SILENCE else None
-
-
-class MissingMessages:
-    """Number of messages that are missing on a periodic topic, determined from the stamps of the received messages.
+def missing_messages(stamps: Sequence[int]) -> tuple[int, float]:
+    """Returns the number of messages that are missing on a periodic topic, and the longest time between two [s].
 
     DDS does not number messages for its users, and does not report messages that it overwrites.
+
+    Args:
+        stamps: Time stamps of the received messages [ns].
     """
-
-    def __init__(self) -> None:
-        """Starts without messages."""
-        self._count, self._longest = 0, 0
-        self._stamps: deque[int] = deque(maxlen=_PERIOD_WINDOW)
-        self._unchecked: list[int] = []
-
-    def add(self, stamp: int) -> None:
-        """Counts a message with a time stamp [ns] that is later than that of the previous message."""
-        if self._stamps:
-            interval = stamp - self._stamps[-1]
-            if interval == 0:
-                return  # the measurement was published twice
-            if interval < 0:  # the clock was set back
-                self._check()
-                self._stamps.clear()
-            else:
-                self._unchecked.append(interval)
-        self._stamps.append(stamp)
-        if len(self._unchecked) >= _CHECKED_INTERVALS:
-            self._check()
-
-    @property
-    def count(self) -> int:
-        """Number of missing messages."""
-        self._check()
-        return max(self._count, 0)
-
-    @property
-    def longest(self) -> float:
-        """Longest time between two messages [s]."""
-        self._check()
-        return 1e-9 * self._longest
-
-    def _check(self) -> None:
-        if len(self._stamps) < 3 or not self._unchecked:
-            return
-        # The stamps are times of an arm's own loop. If messages are published with a period that is no multiple of the
-        # period of this loop, long and short intervals alternate. The sum of two intervals is nearly constant.
-        stamps = np.array(self._stamps)
-        period = float(np.median(stamps[2:] - stamps[:-2])) / 2
-        # A message that was published late is followed by intervals that are shorter than half a period.
-        self._count += int(np.sum(np.rint(np.array(self._unchecked) / period) - 1))
-        self._longest = max(self._longest, *self._unchecked)
-        self._unchecked.clear()
+    intervals = np.diff(np.array(stamps))
+    # An interval is 0 if a measurement was published twice, and negative if the clock was set back.
+    intervals = intervals[intervals > 0]
+    if len(intervals) < 2:
+        return 0, 0.0
+    # The stamps are times of an arm's own loop. If messages are published with a period that is no multiple of the
+    # period of this loop, long and short intervals alternate. The sum of two intervals is nearly constant.
+    period = float(np.median(intervals[1:] + intervals[:-1])) / 2
+    # A message that was published late is followed by intervals that are shorter than half a period.
+    return max(int(np.sum(np.rint(intervals / period) - 1)), 0), 1e-9 * float(intervals.max())
 
 
 class ArmRecorder(ABC):
@@ -115,20 +75,17 @@ class ArmRecorder(ABC):
         arm: Recorded arm.
         path: Path of the new file, which is created at the first measurement.
         source: Network, for messages.
+        num_rows: Number of recorded measurements.
     """
 
     source: str
+    _awaited: str
 
     def __init__(self, arm: Arm, path: str | Path) -> None:
         """Creates a recorder without a file."""
-        self.arm, self.path = arm, path
+        self.arm, self.path, self.num_rows = arm, path, 0
         self._file: RecordingFile | GrowingMcap | None = None
-        self._rate = Rate()
-
-    @property
-    @abstractmethod
-    def num_rows(self) -> int:
-        """Number of recorded measurements."""
+        self._arrivals: deque[float] = deque()
 
     def run(self, duration: float, stopped: Callable[[], bool], show: Callable[[Callable[[], str]], None]) -> None:
         """Records until `stopped` returns true, or until `duration` has elapsed since the first measurement.
@@ -144,11 +101,9 @@ class ArmRecorder(ABC):
                 the first one, or the file cannot be written.
         """
         try:
-            self.subscribe(stopped)
             end, has_begun = time.monotonic() + FIRST_STATUS, False
             while not stopped() and time.monotonic() < end:
-                self._wait(_POLL)
-                self.update()
+                self._receive(_POLL)
                 if not has_begun and self._file is not None:
                     end, has_begun = time.monotonic() + duration, True
                 show(self.describe)
@@ -157,22 +112,6 @@ class ArmRecorder(ABC):
         if self._file is None:
             raise RecordingError(self._no_measurement_reason(stopped()))
 
-    @abstractmethod
-    def subscribe(self, stopped: Callable[[], bool]) -> None:
-        """Subscribes to the messages of the arm. `stopped` returns whether to end the search for the arm.
-
-        Raises:
-            RecordingError: The arm was not found.
-        """
-
-    @abstractmethod
-    def update(self) -> None:
-        """Records the messages that have arrived.
-
-        Raises:
-            RecordingError: The messages have other joints, or the file cannot be written.
-        """
-
     def close(self) -> None:
         """Ends the file."""
         if self._file is not None:
@@ -180,24 +119,22 @@ class ArmRecorder(ABC):
 
     def describe(self) -> str:
         """Returns the text of the status line: the number of rows, the rate, and details of the transport."""
-        rate = self._rate.per_second(time.monotonic())
+        now, arrivals = time.monotonic(), self._arrivals
+        while arrivals and arrivals[0] < now - 1:
+            arrivals.popleft()
         if self._file is None:
-            return f"waiting for {self._awaited()}"
-        if rate is None:
+            return f"waiting for {self._awaited}"
+        if not arrivals or arrivals[-1] < now - SILENCE:
             return f"{self.arm.name}: no more messages; {self.num_rows} rows"
-        return ", ".join([f"{self.arm.name}: {self.num_rows} rows", f"{rate} Hz", *self._details()])
+        return ", ".join([f"{self.arm.name}: {self.num_rows} rows", f"{len(arrivals)} Hz", *self._details()])
 
     @abstractmethod
     def notes(self) -> list[str]:
         """Returns one line for each reason why messages were not recorded, and for missing messages."""
 
     @abstractmethod
-    def _wait(self, seconds: float) -> None:
-        """Waits for a message, at most `seconds` [s]."""
-
-    @abstractmethod
-    def _awaited(self) -> str:
-        """Returns what the recorder waits for before the first measurement."""
+    def _receive(self, seconds: float) -> None:
+        """Waits for a message, at most `seconds` [s], and records the messages that have arrived."""
 
     @abstractmethod
     def _details(self) -> list[str]:
@@ -237,29 +174,19 @@ class LcmRecorder(ArmRecorder):
         self.foreign: Counter[str] = Counter()
         self._filter = StatusFilter(arm.name, arm.num_joints, key, follow_after=_RESTART)
         self._url, self._channel = url, status_channel(arm)
+        self._awaited = self._channel
         self._other_channels: Counter[str] = Counter()
         self._lcm = lcm.LCM(url)
         # The subscription includes all arms, so that an error message can list the channels with messages.
-        self._subscription = self._lcm.subscribe(f"{STATUS_PREFIX}.*", self._receive)
+        self._subscription = self._lcm.subscribe(f"{STATUS_PREFIX}.*", self._on_message)
         self._subscription.set_queue_capacity(_QUEUE)
-
-    @property
-    def num_rows(self) -> int:
-        """Number of recorded measurements."""
-        return self.stream.num_used
-
-    def subscribe(self, stopped: Callable[[], bool]) -> None:
-        """Does nothing: the channels are open."""
-
-    def update(self) -> None:
-        """Does nothing: a status is recorded while the recorder waits."""
 
     def notes(self) -> list[str]:
         """Returns one line for each reason why messages were not recorded, and for lost messages."""
         left_out = [f"messages not recorded, {reason}: {count}" for reason, count in self.foreign.items()]
         return [*left_out, *self.stream.notes()]
 
-    def _receive(self, channel: str, data: bytes) -> None:
+    def _on_message(self, channel: str, data: bytes) -> None:
         if channel != self._channel:
             self._other_channels[channel] += 1
             return
@@ -269,8 +196,9 @@ class LcmRecorder(ArmRecorder):
         if reason in _FOREIGN:
             self.foreign[reason] += 1
             return
-        self._rate.add(now)
+        self._arrivals.append(now)
         status = self.stream.accept(data)
+        self.num_rows = self.stream.num_used
         if self._file is None:
             if self.stream.last is None:
                 return
@@ -278,11 +206,8 @@ class LcmRecorder(ArmRecorder):
         assert not isinstance(self._file, GrowingMcap)
         self._file.write(data, time.time_ns() // 1000, status)
 
-    def _wait(self, seconds: float) -> None:
+    def _receive(self, seconds: float) -> None:
         handle_message(self._lcm, seconds)
-
-    def _awaited(self) -> str:
-        return self._channel
 
     def _details(self) -> list[str]:
         status = self.stream.last
@@ -303,3 +228,147 @@ class LcmRecorder(ArmRecorder):
             "network. Between machines, the URL needs ?ttl=1 and each machine needs a multicast route "
             "(ip route add 239.255.0.0/16 dev DEVICE)"
         )
+
+
+class RosRecorder(ArmRecorder):
+    """Writes the unmodified JointState messages of one arm to a new bag while they arrive, with its transforms.
+
+    Attributes:
+        num_rows: Number of recorded valid messages of the arm, without those on a separate topic, e.g. of the jaw.
+    """
+
+    def __init__(
+        self,
+        arm: Arm,
+        path: str | Path,
+        topic: str | None = None,
+        domain: int | RosDomain | None = None,
+        report: Callable[[str], None] = lambda line: None,
+    ) -> None:
+        """Creates a recorder. The file is created when the topic of the arm is found.
+
+        Args:
+            arm: Arm whose joint states are recorded. Its `separate_joint` is recorded from a separate topic.
+            path: Path of the new bag, *.mcap.
+            topic: JointState topic or its namespace. Default: the only topic `/<ARM>/measured_js`, in any namespace,
+                where ARM is the name of the arm, optionally followed by a number.
+            domain: ROS domain. None: the environment variable ROS_DOMAIN_ID, or else 0. A domain that is open already
+                must have received the topics of the arm.
+            report: Function that is called with one line if the search for the arm takes longer than a second.
+
+        Raises:
+            RecordingError: A new bag cannot be created at `path`.
+            DvrkDrakeError: The package cyclonedds is missing, or the domain cannot be used.
+        """
+        check_stream_output(path, (".mcap",))
+        super().__init__(arm, path)
+        self._topic, self._report = topic, report
+        self._domain = open_ros_domain(domain) if domain is None or isinstance(domain, int) else domain
+        self.source = self._domain.name
+        self._num_invalid = 0
+        self._subscriptions: list[Subscription[JointState]] = []
+        self._silent: set[str] = set()
+        self._stamps: dict[str, array[int]] = {}
+        self._frames: FrameMessages | None = None
+        self._positions: dict[str, float] = {}
+
+    def run(self, duration: float, stopped: Callable[[], bool], show: Callable[[Callable[[], str]], None]) -> None:
+        """Records, then leaves the domain; see `ArmRecorder.run`."""
+        with closing(self._domain):
+            self.subscribe(stopped)
+            super().run(duration, stopped, show)
+
+    def update(self) -> None:
+        """Records the messages that have arrived."""
+        for subscription in self._subscriptions:
+            for message, published in subscription.take():
+                self._record(subscription, message, published)
+
+    def notes(self) -> list[str]:
+        """Returns one line each for missing messages, invalid messages, and topics without messages."""
+        missing = [missing_messages(stamps) for stamps in self._stamps.values()]
+        lines = []
+        if count := sum(number for number, _ in missing):
+            longest = max(seconds for _, seconds in missing)
+            lines.append(f"messages missing (gaps of the time stamps): {count}, longest gap {longest:.3g} s")
+        if self._num_invalid:
+            lines.append(f"messages with header stamp 0, which marks invalid data: {self._num_invalid}")
+        silent = [f"no message on {topic}; commands of dvrk-drake need this topic" for topic in sorted(self._silent)]
+        return [*lines, *silent]
+
+    def subscribe(self, stopped: Callable[[], bool]) -> None:
+        """Waits for the topic of the arm, then subscribes to it and to the separate topic, if there is one."""
+        from dvrk_drake.systems.ros.messages import JointState
+
+        main = find_topic(self._domain, self.arm, self._topic, stopped=stopped, report=self._report)
+        self._awaited = f"a valid message on {main}"
+        topics = self._domain.joint_state_topics()
+        others = joint_state_topics(self.arm, main.rpartition("/")[0])[1:]
+        for name in (main, *(topic.name for topic in others)):
+            subscription = self._domain.subscribe(name, JointState, depth=_DEPTH, reliable=topics.get(name, True))
+            self._subscriptions.append(subscription)
+            self._silent.add(name)
+            self._stamps[name] = array("q")
+
+    def _record(self, subscription: Subscription[JointState], message: JointState, published: int) -> None:
+        """Writes a message. The bag is created at the first valid message of the arm."""
+        is_valid = message.header.nanoseconds != 0
+        if subscription is self._subscriptions[0]:
+            self._num_invalid += not is_valid
+            if self._file is None and is_valid:
+                self._check_joints(message)
+                self._frames = FrameMessages(self.arm, subscription.topic.rpartition("/")[0])
+                measured = [Topic(each.topic, JOINT_STATE) for each in self._subscriptions]
+                self._file = GrowingMcap(self.path, [*measured, *self._frames.topics])
+        if self._file is None:
+            return
+        assert isinstance(self._file, GrowingMcap)
+        # ROS 2 uses version 1 of the CDR encoding.
+        arrived = time.time_ns()
+        self._file.write_encoded(subscription.topic, message.serialize(use_version_2=False), published, arrived)
+        if is_valid:
+            self._write_frames(self._file, message, arrived)
+            self._stamps[subscription.topic].append(message.header.nanoseconds)
+        self._silent.discard(subscription.topic)
+        if subscription is self._subscriptions[0]:
+            self.num_rows += is_valid
+            self._arrivals.append(time.monotonic())
+
+    def _write_frames(self, bag: GrowingMcap, message: JointState, arrived: int) -> None:
+        """Writes the transforms at the latest positions of all joints, once all joints have been measured."""
+        assert self._frames is not None
+        self._positions |= zip(message.name, message.position, strict=False)
+        if all(joint in self._positions for joint in self.arm.joint_names):
+            q = np.array([self._positions[joint] for joint in self.arm.joint_names])
+            self._frames.write(bag, message.header.nanoseconds, q, arrived)
+
+    def _check_joints(self, message: JointState) -> None:
+        needed = [joint for joint in self.arm.joint_names if joint != self.arm.separate_joint]
+        if missing := [joint for joint in needed if joint not in message.name]:
+            raise RecordingError(
+                f"{self._subscriptions[0].topic} has the joints {', '.join(message.name) or 'none'}; {self.arm.name} "
+                f"also needs {', '.join(missing)}. Check --arm, --topic and the instrument."
+            )
+
+    def _receive(self, seconds: float) -> None:
+        self._domain.wait(seconds)
+        self.update()
+
+    def _details(self) -> list[str]:
+        return [f"no message on {topic}" for topic in sorted(self._silent)]
+
+    def _no_measurement_reason(self, was_stopped: bool) -> str:
+        topic = f"{self._subscriptions[0].topic} of {self.source}"
+        if self._num_invalid:
+            return f"{topic}: all {self._num_invalid} messages have header stamp 0 (invalid data). Home the arm first."
+        if was_stopped:
+            return f"{self.path} was not written: the recording ended before the first message on {topic}"
+        return f"no message within {FIRST_STATUS:.0f} s on {topic}"
+
+
+def bag_path(output: str | Path) -> Path:
+    """Returns the path of the first bag of an output that does not exist: poses_1.mcap, poses_2.mcap for poses.csv."""
+    output, number = Path(output), 1
+    while os.path.lexists(path := output.with_name(f"{output.stem}_{number}.mcap")):
+        number += 1
+    return path

@@ -12,7 +12,7 @@ from dvrk_drake.errors import CollectionError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes.arm_controller import GoalController, MotionStyle
 from dvrk_drake.processes.collector import DELAY, CollectionSettings, Collector, approaches, estimated_duration, summary
-from dvrk_drake.processes.ros_recorder import bag_path
+from dvrk_drake.processes.recorder import bag_path
 from dvrk_drake.systems.ros.crtk_link import GOAL_PERIOD, CrtkMoveLink
 
 #: Interval of the measurements [s].

@@ -27,7 +27,7 @@ def recorder(request, tmp_path, monkeypatch):
 
         def receive(message, seconds):
             clock.now = 100.0 + seconds
-            made._receive(status_channel(ARM), message if isinstance(message, bytes) else message.encode())
+            made._on_message(status_channel(ARM), message if isinstance(message, bytes) else message.encode())
 
         made.receive = receive
         return made
@@ -87,7 +87,7 @@ def test_bag_has_the_commands_and_the_transforms(tmp_path):
     made, sent = LcmRecorder(ARM, tmp_path / "a.mcap", "memq://"), statuses(100)
     for status in sent:
         status.effort_commanded = [2 * effort for effort in status.effort_measured]
-        made._receive(status_channel(ARM), status.encode())
+        made._on_message(status_channel(ARM), status.encode())
     made._file.close()
     with AnyReader([tmp_path / "a.mcap"]) as bag:
         counts = {topic: info.msgcount for topic, info in bag.topics.items()}
