@@ -43,15 +43,6 @@ def test_known_friction_bounds_presliding_only(arm, motion):
     np.testing.assert_array_equal(changed, presliding)
 
 
-def test_friction_efforts(arm, motion):
-    problem = motion_problem([Observations(motion, arm)])
-    effects = [(e.coordinate, e.kind) for e in problem.columns.effects]
-    used = np.array([effects.index(("actuator.turn", "offset")), effects.index(("actuator.lift", "viscous"))])
-    friction = problem.friction_efforts(used, np.array([5.0, 2.0]))
-    expected = 2.0 * np.sqrt(np.mean(problem.columns.shapes[1][:, used[1]] ** 2))
-    np.testing.assert_allclose(friction, [0.0, expected, 0.0], rtol=1e-9, atol=1e-12)
-
-
 def test_gears_rest_despite_noise_of_the_velocity(arm):
     gear = SimpleNamespace(arm=arm, effects=[ActuatorEffect("actuator.turn", "presliding", 1e-5)], coefficients=[2.0])
     bound = DryFrictionBound(gear)

@@ -228,7 +228,7 @@ def test_interrupted_study_keeps_rows_and_cancels_rest(reference, tmp_path):
     assert path.read_bytes() == reference
 
 
-def test_wilson_interval_bounds_are_1_96_standard_errors_from_share():
+def test_wilson_bounds_are_1_96_standard_errors_away():
     for p in wilson_interval(30, 120):
         assert abs(30 / 120 - p) == pytest.approx(norm.ppf(0.975) * math.sqrt(p * (1 - p) / 120))
 

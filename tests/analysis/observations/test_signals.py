@@ -6,8 +6,7 @@ from scipy.signal import lfilter
 
 from dvrk_drake.analysis.observations import signals as module
 from dvrk_drake.analysis.observations.motion_difference import Whitening
-from dvrk_drake.analysis.observations.observations import Observations
-from dvrk_drake.analysis.observations.repetition import find_period, motion_floor, repeatability_floor
+from dvrk_drake.analysis.observations.repetition import find_period, repeatability_floor
 from dvrk_drake.analysis.observations.signals import (
     MOTION_FREQUENCY,
     ORDER,
@@ -19,8 +18,6 @@ from dvrk_drake.analysis.observations.signals import (
     resample,
     spectra,
 )
-from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.recordings.recording import Recording
 
 pytestmark = pytest.mark.numeric
 
@@ -42,17 +39,6 @@ def test_low_pass_has_the_butterworth_gain_and_no_delay(frequency):
     ratio = np.tan(np.pi * frequency / RATE) / np.tan(np.pi * 20.0 / RATE)
     assert in_phase == pytest.approx(1 / (1 + ratio ** (2 * ORDER)), abs=1e-3)
     assert late == pytest.approx(0.0, abs=1e-3)
-
-
-def test_low_pass_halves_the_amplitude_at_each_columns_cut_off():
-    cut_offs = np.array([10.0, 30.0, 200.0, 500.0])
-    x = np.sin(2 * np.pi * np.array([10.0, 30.0, 30.0, 30.0]) * T[:, None])
-    y = low_pass(x, RATE, cut_offs)
-    for column, frequency, gain in zip(y.T, (10.0, 30.0), (0.5, 0.5), strict=False):
-        assert sine_and_cosine(column, frequency)[0] == pytest.approx(gain, abs=1e-3)
-    np.testing.assert_array_equal(y[:, 2:], x[:, 2:])  # at half the rate and above a column stays as it is
-    np.testing.assert_allclose(low_pass(x[:, 0], RATE, 10.0), y[:, 0], atol=1e-12)
-    np.testing.assert_allclose(low_pass(np.full(400, 3.0), RATE, 5.0), 3.0, rtol=1e-9, atol=1e-12)
 
 
 def test_correlation_is_the_sum_of_products():
@@ -133,20 +119,6 @@ def test_repeatability_floor_equals_the_noise_share(noise):
     np.testing.assert_allclose(floor, noise / rms, rtol=0.05, atol=1e-9)
     tau[:, 1] = 0.0
     assert np.isnan(repeatability_floor(tau, SLOW_RATE, 5.0, SLOW_RATE)[1])
-
-
-def test_lost_rows_do_not_change_the_repeatability():
-    arm, t = load_arm("psm"), np.arange(1000) / 50
-    phase = 2 * np.pi / 5 * t[:, None] * np.array([1, 2, 1, 3, 2, 1, 3]) + np.arange(7)
-    noise = np.random.default_rng(6).normal(size=phase.shape)
-    q = (arm.position_lower + arm.position_upper) / 2 + 0.2 * (arm.position_upper - arm.position_lower) * np.sin(phase)
-    whole = Recording(q, arm.effort_limits * (0.2 * np.cos(phase) + 0.002 * noise), t=t, coordinates="actuator")
-    floors = []
-    for recording in (whole, whole.select(np.delete(np.arange(1000), [300, 666]))):
-        grid = Observations(recording, arm).grid
-        floors.append(motion_floor(recording.tau, grid, 5.0))
-    # Two interpolated rows hardly change an RMS value of 1000 rows.
-    np.testing.assert_allclose(floors[1], floors[0], rtol=0.1, atol=1e-6)
 
 
 @pytest.mark.parametrize("period", [5.0, None])
