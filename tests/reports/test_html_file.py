@@ -129,17 +129,6 @@ def test_playing_animation_moves_the_cursor(opened):
     assert opened.page.locator(".time").text_content() == stopped
 
 
-def test_zoom_of_a_plot(opened):
-    opened, _ = opened
-    box = opened.page.locator("[data-time] .nsewdrag").first.bounding_box()
-    opened.page.mouse.move(box["x"] + box["width"] / 4, box["y"] + 20)
-    opened.page.mouse.down()
-    opened.page.mouse.move(box["x"] + box["width"] / 2, box["y"] + 25, steps=5)
-    opened.page.mouse.up()
-    opened.wait_for("document.querySelector('[data-time]').layout.xaxis.range[1] < 2.2")
-    assert opened.page.evaluate("document.querySelector('[data-time]').layout.xaxis.range[0]") > 0.8
-    # The cursor at 0 s is outside the zoomed range.
-    assert opened.page.locator(".cursor:visible").count() == 0
 
 
 def test_copy_button_copies_the_command(opened):
