@@ -12,11 +12,12 @@ from dvrk_drake.experiments.demo import DemoResult, load_plan
 from dvrk_drake.experiments.teleoperation import TeleoperationResult
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.files import atomic_write
+from dvrk_drake.reports.colours import FITTED, LIMIT, NEUTRAL, REFERENCE
 from dvrk_drake.reports.html_file import write_html
 from dvrk_drake.reports.image_files import write_images
 from dvrk_drake.reports.page import Block, Page, Plot, Scene, Section, Table, Text
 from dvrk_drake.reports.playback import playback
-from dvrk_drake.reports.plot import FITTED, LIMIT, NEUTRAL, REFERENCE, Curve, Guide, Mark, Panel, joint_label
+from dvrk_drake.reports.plot import Curve, Guide, Mark, Panel, joint_label
 
 _REAL_ARM = (
     "With a real arm: record at least 40 different static poses with `dvrk-drake collect`, or convert a recording of "

@@ -17,9 +17,10 @@ from dvrk_drake.dynamics.actuator_effects import (
 from dvrk_drake.dynamics.dynamic_model import effect_shapes
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import POSITION_KINDS, DriveEffect
+from dvrk_drake.reports.colours import FITTED, MEASURED
 from dvrk_drake.reports.efforts import Efforts
 from dvrk_drake.reports.page import Plot
-from dvrk_drake.reports.plot import FITTED, MEASURED, Curve, Mark, Panel, axis_range
+from dvrk_drake.reports.plot import Curve, Mark, Panel, axis_range
 
 #: Number of points of a curve, and largest number of dots in a panel.
 _POINTS, _DOTS = 201, 500

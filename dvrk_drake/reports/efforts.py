@@ -19,15 +19,9 @@ from dvrk_drake.analysis.validation import StaticValidation
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.reports.colours import COMMANDED, FITTED, HELD_OUT, MEASURED, NEUTRAL, REFERENCE, SERIES
 from dvrk_drake.reports.page import Plot, Table, Text
 from dvrk_drake.reports.plot import (
-    COMMANDED,
-    FITTED,
-    HELD_OUT,
-    MEASURED,
-    NEUTRAL,
-    REFERENCE,
-    SERIES,
     Band,
     Bars,
     Curve,

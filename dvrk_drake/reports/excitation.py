@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.excitation.design import ExcitationDesign
 from dvrk_drake.analysis.excitation.static_poses import StaticPoseDesign
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.reports.colours import COMMANDED, LIMIT
 from dvrk_drake.reports.page import Block, Page, Plot, Scene, Section, Table
 from dvrk_drake.reports.playback import playback
-from dvrk_drake.reports.plot import COMMANDED, LIMIT, Curve, Guide, Mark, Panel, Style, joint_label, length_unit
+from dvrk_drake.reports.plot import Curve, Guide, Mark, Panel, Style, joint_label, length_unit
 
 #: Number of points per harmonic of a period in the plots: enough for a smooth curve.
 _POINTS = 20

@@ -18,8 +18,9 @@ from dvrk_drake.export.gravity_compensation_loss import ROUNDING, CompensationLo
 from dvrk_drake.export.model_export import DriveApproximation, ModelExport
 from dvrk_drake.export.model_writer import LinkChange, changed_links
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.reports.colours import FITTED, LIMIT, NEUTRAL, REFERENCE
 from dvrk_drake.reports.page import Block, Page, Plot, Section, Table, Text
-from dvrk_drake.reports.plot import FITTED, LIMIT, NEUTRAL, REFERENCE, Band, Curve, Guide, Mark, Panel, Style
+from dvrk_drake.reports.plot import Band, Curve, Guide, Mark, Panel, Style
 
 #: Number of bins over the position of a joint.
 _BINS = 60

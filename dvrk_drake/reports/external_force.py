@@ -8,21 +8,10 @@ from numpy.typing import NDArray
 from dvrk_drake.analysis.external_force import ExternalForce
 from dvrk_drake.dynamics.kinematics import is_measurable
 from dvrk_drake.models.effects_schema import half_width
+from dvrk_drake.reports.colours import FITTED, HELD_OUT, NEUTRAL
 from dvrk_drake.reports.page import Block, Page, Plot, Scene, Section, Table, Text, warning_texts
 from dvrk_drake.reports.playback import frame_times, playback
-from dvrk_drake.reports.plot import (
-    FITTED,
-    HELD_OUT,
-    NEUTRAL,
-    Band,
-    Curve,
-    Guide,
-    Mark,
-    Panel,
-    decimated,
-    effort_unit,
-    joint_label,
-)
+from dvrk_drake.reports.plot import Band, Curve, Guide, Mark, Panel, decimated, effort_unit, joint_label
 
 #: Largest number of plotted rows. Each curve has about this number of points, twice the pixels of a wide page.
 _MAX_POINTS = 4000

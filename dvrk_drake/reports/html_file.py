@@ -29,8 +29,8 @@ from plotly.offline import get_plotlyjs
 
 from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.models.files import atomic_write, open_input
+from dvrk_drake.reports.colours import DARK
 from dvrk_drake.reports.page import Page, Plot, Scene, Table, Text, Verdict, cell_text
-from dvrk_drake.reports.plot import DARK
 from dvrk_drake.reports.plotly_figures import plotly_figure
 
 

@@ -18,8 +18,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from dvrk_drake.models.files import atomic_write
+from dvrk_drake.reports.colours import SERIES
 from dvrk_drake.reports.page import Page, Plot
-from dvrk_drake.reports.plot import SERIES, Band, Bars, Curve, Guide, Mark, Panel
+from dvrk_drake.reports.plot import Band, Bars, Curve, Guide, Mark, Panel
 
 #: Width of all images [inch].
 WIDTH = 11.0

@@ -13,8 +13,9 @@ from dvrk_drake.analysis.payload import (
     equally_good_links,
 )
 from dvrk_drake.models.locked_joints import locked_option
+from dvrk_drake.reports.colours import FITTED
 from dvrk_drake.reports.page import Block, Page, Plot, Section, Table, Text, warning_texts
-from dvrk_drake.reports.plot import FITTED, Bars, category_panel
+from dvrk_drake.reports.plot import Bars, category_panel
 
 
 def payload_page(result: PayloadIdentification, *, model_path: str | None = None, options: str = "") -> Page:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.reports.plot import REFERENCE
+from dvrk_drake.reports.colours import REFERENCE
 
 if TYPE_CHECKING:
     from dvrk_drake.systems.arm_view.efforts import DrawnForce

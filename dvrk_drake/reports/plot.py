@@ -1,4 +1,4 @@
-"""Marks, panels and colours of a plot, independent of the library that draws them."""
+"""Marks and panels of a plot, independent of the library that draws them."""
 
 from __future__ import annotations
 
@@ -10,42 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.models.arm import Arm
-
-# One colour per role, and a palette for series without a role. People with deuteranopia (missing green receptors) can
-# distinguish them: `tests/reports/test_image_files.py` simulates their vision. The lightness also differs, for prints
-# without colour.
-#: Measured values.
-MEASURED = "#1f1f1f"
-#: Values of a model at the data it was fitted to, and predictions of a model.
-FITTED = "#397bdc"
-#: Values of a model at data that were not used to fit it.
-HELD_OUT = "#e8a532"
-#: Commanded values, for example desired positions.
-COMMANDED = "#780477"
-#: Values to compare with: a nominal model, another method, a published value, a settling band.
-REFERENCE = "#2caa67"
-#: Limits of the arm, thresholds, and values beyond them.
-LIMIT = "#b42508"
-#: Context without a message of its own, for example zero torque or a tolerance band.
-NEUTRAL = "#c4c8cf"
-
-#: Colours of series without a role, for example variations or joints in one plot. Use them in this order.
-SERIES = ("#1a429b", "#eb9804", "#cd1265", "#84ddb8", "#4e5d02", "#976a9f", "#fb6b5f", "#570e2d")
-
-#: Mapping from a colour to its replacement on a dark page. The other colours are visible on both.
-DARK = {
-    MEASURED: "#e4e8ec",
-    "rgba(31,31,31,0.35)": "rgba(228,232,236,0.4)",
-    COMMANDED: "#d67ad2",
-    LIMIT: "#ff7a5c",
-    "#1a429b": "#7ea2f0",
-    "#cd1265": "#f0569a",
-    "#4e5d02": "#b3c75b",
-    "#570e2d": "#d98aa8",
-    "#1b2733": "#dfe5ea",
-    "#6b7785": "#9aa6b2",
-    "#e3e7eb": "#34404b",
-}
+from dvrk_drake.reports.colours import SERIES
 
 Values = NDArray[Any] | Sequence[float]
 #: How a curve is drawn. "broad" is a thick, light line for measurements below the thin lines of predictions. "step" is
@@ -63,7 +28,7 @@ class Curve:
     Attributes:
         name: Name in the legend. Curves with one name in several panels have one entry. "": no entry.
         x, y: Coordinates (m,).
-        colour: Colour as "#rrggbb", see the constants of this module.
+        colour: Colour as "#rrggbb", see `colours`.
         style: How the curve is drawn.
         texts: Texts (m,) that are shown when the pointer is over a point. Empty: the coordinates.
     """

@@ -9,8 +9,9 @@ import plotly.graph_objects as go
 from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
+from dvrk_drake.reports.colours import SERIES
 from dvrk_drake.reports.page import Plot
-from dvrk_drake.reports.plot import SERIES, Band, Bars, Curve, Guide, Mark, Panel, Values
+from dvrk_drake.reports.plot import Band, Bars, Curve, Guide, Mark, Panel, Values
 
 #: Fonts of the page and of its plots. No font is loaded.
 FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Noto Sans', 'DejaVu Sans', sans-serif"

@@ -9,8 +9,9 @@ from dvrk_drake.analysis.check.report import RecordingReport
 from dvrk_drake.analysis.observations.signals import spectra
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.recordings.recording import Recording
+from dvrk_drake.reports.colours import LIMIT, MEASURED, REFERENCE
 from dvrk_drake.reports.page import Block, Level, Page, Plot, Section, Table, Text
-from dvrk_drake.reports.plot import LIMIT, MEASURED, REFERENCE, Curve, Guide, Panel, effort_unit, joint_label
+from dvrk_drake.reports.plot import Curve, Guide, Panel, effort_unit, joint_label
 
 #: Number of bins per octave of frequency. The power spectral densities are averaged in each bin.
 _BINS_PER_OCTAVE = 4

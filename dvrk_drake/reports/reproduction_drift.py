@@ -18,19 +18,9 @@ from dvrk_drake.experiments.tuning_model_based import friction
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import EFFECT_NAMES
 from dvrk_drake.models.plant import make_arm_plant
+from dvrk_drake.reports.colours import FITTED, LIMIT, MEASURED, REFERENCE
 from dvrk_drake.reports.page import Block, Plot, Section, Table, Text
-from dvrk_drake.reports.plot import (
-    FITTED,
-    LIMIT,
-    MEASURED,
-    REFERENCE,
-    Curve,
-    Guide,
-    Mark,
-    Panel,
-    joint_label,
-    length_unit,
-)
+from dvrk_drake.reports.plot import Curve, Guide, Mark, Panel, joint_label, length_unit
 
 #: Interval over which a drift rate is averaged, and simulated time after the release of an arm without friction [s].
 RATE_TIME, FRICTIONLESS_DURATION = 1.0, 3.0

@@ -28,21 +28,9 @@ from dvrk_drake.experiments.paper_experiments import (
 from dvrk_drake.experiments.transparency import Compensation, OperatorForces, random_path, simulate_operator
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.progress import step_progress
+from dvrk_drake.reports.colours import COMMANDED, HELD_OUT, LIMIT, MEASURED, REFERENCE, SERIES
 from dvrk_drake.reports.page import Block, Plot, Section, Table, Text
-from dvrk_drake.reports.plot import (
-    COMMANDED,
-    HELD_OUT,
-    LIMIT,
-    MEASURED,
-    REFERENCE,
-    SERIES,
-    Curve,
-    Guide,
-    Mark,
-    Panel,
-    Style,
-    joint_label,
-)
+from dvrk_drake.reports.plot import Curve, Guide, Mark, Panel, Style, joint_label
 from dvrk_drake.reports.reproduction_drift import JOINTS, numbers
 from dvrk_drake.reports.transparency import forces_plot, forces_table
 from dvrk_drake.workers import await_results

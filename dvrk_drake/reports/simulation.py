@@ -7,21 +7,9 @@ from numpy.typing import NDArray
 
 from dvrk_drake.experiments.simulation import Simulation
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.reports.colours import COMMANDED, LIMIT, MEASURED, NEUTRAL, REFERENCE
 from dvrk_drake.reports.page import Page, Plot, Section, Table
-from dvrk_drake.reports.plot import (
-    COMMANDED,
-    LIMIT,
-    MEASURED,
-    NEUTRAL,
-    REFERENCE,
-    Curve,
-    Guide,
-    Mark,
-    Panel,
-    effort_unit,
-    joint_label,
-    length_unit,
-)
+from dvrk_drake.reports.plot import Curve, Guide, Mark, Panel, effort_unit, joint_label, length_unit
 
 #: Smallest range of a position axis and of an error axis [rad]; a tenth of it in m. Smaller ranges would magnify the
 #: noise of a joint at rest.

@@ -12,8 +12,9 @@ from dvrk_drake.experiments.study import Study
 from dvrk_drake.experiments.study_measures import Measure
 from dvrk_drake.experiments.study_run import Row, wilson_interval
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.reports.colours import SERIES
 from dvrk_drake.reports.page import Block, Page, Plot, Section, Table, Text
-from dvrk_drake.reports.plot import SERIES, Curve, Panel
+from dvrk_drake.reports.plot import Curve, Panel
 
 #: Maximum number of variations in the answer, and of failed runs that a terminal lists without --verbose.
 _MAX_COUNT = 3

@@ -12,8 +12,9 @@ from dvrk_drake.experiments.tuning_bench import band, step_size
 from dvrk_drake.experiments.tuning_model_based import ArmDesign, JointDesign, friction
 from dvrk_drake.experiments.tuning_procedure import JointProcedure
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.reports.colours import COMMANDED, LIMIT, REFERENCE
 from dvrk_drake.reports.page import Block, Page, Plot, Section, Table, Text
-from dvrk_drake.reports.plot import COMMANDED, LIMIT, REFERENCE, Curve, Guide, Mark, Panel, joint_label, series
+from dvrk_drake.reports.plot import Curve, Guide, Mark, Panel, joint_label, series
 
 
 def tuning_page(tuning: Tuning, *, gains_path: str | None = None) -> Page:

@@ -42,9 +42,10 @@ from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.reports import reproduction as reproduction_page
 from dvrk_drake.reports import reproduction_drift as drift
+from dvrk_drake.reports.colours import MEASURED
 from dvrk_drake.reports.image_files import write_images
 from dvrk_drake.reports.page import Page, Plot, Section, Table, Text
-from dvrk_drake.reports.plot import MEASURED, Curve, Panel
+from dvrk_drake.reports.plot import Curve, Panel
 from dvrk_drake.reports.reproduction import NAMES, reproduce, write_page
 from dvrk_drake.reports.reproduction_drift import reproduce_figure_5, share
 from dvrk_drake.reports.reproduction_figures import reproduce_transparency

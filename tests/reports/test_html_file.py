@@ -8,9 +8,10 @@ from pydrake.geometry import Box, MeshcatAnimation
 from pydrake.math import RigidTransform
 from report_checks import check_report, printed_text
 
+from dvrk_drake.reports.colours import LIMIT, MEASURED, SERIES
 from dvrk_drake.reports.html_file import write_html
 from dvrk_drake.reports.page import Page, Plot, Scene, Section, Table, Text, Verdict
-from dvrk_drake.reports.plot import LIMIT, MEASURED, SERIES, Bars, Curve, Guide, Panel, category_panel
+from dvrk_drake.reports.plot import Bars, Curve, Guide, Panel, category_panel
 from dvrk_drake.reports.plotly_figures import plotly_figure
 from dvrk_drake.systems.arm_view.page import start_meshcat
 

@@ -11,10 +11,11 @@ from figure_rules import checked_figures, colours_of, figure_faults
 from dvrk_drake.experiments.simulation import Simulation
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings.recording import Recording
-from dvrk_drake.reports import plot
+from dvrk_drake.reports import colours
+from dvrk_drake.reports.colours import FITTED, MEASURED, SERIES
 from dvrk_drake.reports.image_files import WIDTH, draw_plot, write_images
 from dvrk_drake.reports.page import Plot
-from dvrk_drake.reports.plot import FITTED, MEASURED, SERIES, Curve, Panel
+from dvrk_drake.reports.plot import Curve, Panel
 from dvrk_drake.reports.simulation import simulation_page
 
 MTM = load_arm("mtml")
@@ -81,7 +82,7 @@ def test_simulation_shows_position_error_effort_and_disturbance(monkeypatch, tmp
 # Colours of roles and series are different for people with and without deuteranopia, and in a grey print.
 
 
-ROLES = [value for name, value in vars(plot).items() if name.isupper() and isinstance(value, str)]
+ROLES = [value for name, value in vars(colours).items() if name.isupper() and isinstance(value, str)]
 #: Linear RGB of a colour -> linear RGB that a deuteranope sees as the same colour. Machado, Oliveira and
 #: Fernandes (2009), "A physiologically-based model for simulation of color vision deficiency", severity 1.0.
 DEUTERANOPIA = np.array(
