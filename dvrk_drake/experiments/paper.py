@@ -249,11 +249,6 @@ class ReproductionSession:
         poses = self.random_poses(what.arm, count)
         return release_all(what.arm, model, poses, self.executor, report, duration=duration, seed=self.seed, **more)
 
-    @staticmethod
-    def nominal(arm: Arm) -> Arm:
-        """Returns the arm with the links and effects of its files."""
-        return dvrk.load_arm(arm.source)
-
     def random_poses(self, arm: Arm, count: int) -> NDArray[np.float64]:
         """Returns random poses (count, n) inside the limits. Pose i depends on the seed and i, but not on the count."""
         return np.array([arm.sample_poses(1, np.random.default_rng([self.seed, i]))[0] for i in range(count)])

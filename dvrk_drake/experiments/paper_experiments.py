@@ -1,9 +1,9 @@
-"""Step responses of a simulated MTM with the paper's controller and with our controller (Fig. 7 of the paper)."""
+"""DH table of an arm (Table I of the paper), and step responses with the paper's and with our controller (Fig. 7)."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
@@ -144,8 +144,8 @@ def longest_period(arm: Arm) -> float:
     return float(2 * np.pi / values.imag[moves_joint_2].min())
 
 
-#: Number of random poses from which the rows of the DH table are computed, and at which the axes are evaluated.
-TABLE_POSES, AXIS_POSES = 20, 200
+#: Number of random poses from which the rows of the DH table are computed.
+TABLE_POSES = 20
 
 
 def recomputed_table(arm: Arm) -> tuple[NDArray[np.float64], float]:
@@ -187,30 +187,3 @@ def _dh_transform(theta: float, d: float, alpha: float, a: float) -> NDArray[np.
     """Returns the transform Rz(theta) Tz(d) Tx(a) Rx(alpha) (4, 4)."""
     c, s, ca, sa = np.cos(theta), np.sin(theta), np.cos(alpha), np.sin(alpha)
     return np.array([[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d], [0, 0, 0, 1.0]])
-
-
-def mechanism_errors(arm: Arm, remote_axis: str, wrist_axes: Sequence[str]) -> tuple[float, float]:
-    """Evaluates the axes of an arm with a remote centre of motion at random poses.
-
-    Args:
-        arm: Arm. The origin of its base frame is the remote centre.
-        remote_axis: Name of the joint whose axis passes through the remote centre.
-        wrist_axes: Names of the two joints of the wrist.
-
-    Returns:
-        Maximum distance of the remote axis from the remote centre [m], and minimum angle of the wrist axes [rad].
-    """
-    plant = make_arm_plant(arm)
-    context = plant.CreateDefaultContext()
-    remote, angle = 0.0, np.pi
-    for q in arm.sample_poses(AXIS_POSES, np.random.default_rng(0)):
-        set_arm_positions(plant, context, arm, q)
-        X_WJ = plant.GetJointByName(remote_axis).frame_on_parent().CalcPoseInWorld(context)
-        shaft = X_WJ.rotation() @ plant.GetJointByName(remote_axis).revolute_axis()
-        remote = max(remote, float(np.linalg.norm(np.cross(X_WJ.translation(), shaft))))
-        pitch, yaw = (
-            joint.frame_on_parent().CalcPoseInWorld(context).rotation() @ joint.revolute_axis()
-            for joint in map(plant.GetJointByName, wrist_axes)
-        )
-        angle = min(angle, float(np.arccos(min(1.0, abs(float(pitch @ yaw))))))
-    return remote, angle

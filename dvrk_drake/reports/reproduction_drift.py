@@ -11,19 +11,15 @@ from numpy.typing import ArrayLike, NDArray
 from dvrk_drake.dynamics.friction_compensation import MAX_HYSTERESIS_RATIO
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.experiments.paper import PAPER, ReproductionSession, with_zero_torque
-from dvrk_drake.experiments.paper_experiments import AXIS_POSES, mechanism_errors
 from dvrk_drake.experiments.releases import APPROACH, APPROACH_TIME, APPROACHED_RELEASE, BAND, SAMPLE_PERIOD, Drifts
 from dvrk_drake.experiments.study_run import wilson_interval
 from dvrk_drake.experiments.tuning_model_based import friction
 from dvrk_drake.models.arm import Arm
-from dvrk_drake.models.effects_schema import EFFECT_NAMES
-from dvrk_drake.models.plant import make_arm_plant
+from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.reports.colours import FITTED, LIMIT, MEASURED, REFERENCE
 from dvrk_drake.reports.page import Block, Plot, Section, Table, Text
 from dvrk_drake.reports.plot import Curve, Guide, Mark, Panel, joint_label, length_unit
 
-#: Interval over which a drift rate is averaged, and simulated time after the release of an arm without friction [s].
-RATE_TIME, FRICTIONLESS_DURATION = 1.0, 3.0
 #: Smallest drawn drift [rad; m]. Smaller drifts are drawn at this value.
 SMALLEST_DRIFT = 1e-5
 JOINTS = tuple(f"J{j}" for j in range(1, 8))
@@ -42,7 +38,7 @@ def share(held: int, total: int) -> str:
 
 
 def reproduce_figure_5(session: ReproductionSession) -> Section:
-    """Simulates releases with torques on all joints: with both models, after an approach, and without friction."""
+    """Simulates releases with torques on all joints: with both models, and after an approach."""
     mtm, sizes, theirs = session.mtm, session.sample_sizes, session.paper_model
     many, few = sizes.releases, sizes.few_releases
     approached = partial(session.release, mtm, mtm.model, few, approach=True)
@@ -56,14 +52,6 @@ def reproduce_figure_5(session: ReproductionSession) -> Section:
             "releasing ours, hysteresis compensated", hysteresis_ratio=MAX_HYSTERESIS_RATIO
         ),
     }
-    effects = tuple(name for name in EFFECT_NAMES if name != "friction")
-    sliding = partial(session.release, mtm, effects=effects, duration=FRICTIONLESS_DURATION)
-    frictionless = {
-        PAPERS: sliding(theirs, few, "no friction, the paper's"),
-        OURS: sliding(mtm.model, few, "no friction, ours"),
-        "ours with damping": sliding(mtm.model, many, "no friction, ours damped", mode="damped"),
-    }
-    staying = [_num_staying(frictionless[name]) for name in (PAPERS, OURS)]
     remarks = (
         "The controller compensates gravity only. Each release starts at rest, at a random pose inside the limits, and "
         f"lasts {sizes.duration:g} s. Joints that the paper's model does not hold in half of the releases: "
@@ -73,14 +61,10 @@ def reproduce_figure_5(session: ReproductionSession) -> Section:
         "friction, which then push joints back. Failed releases by joint: "
         + "; ".join(f"{name}: {_failed(drifts[name])}" for name in list(drifts)[2:])
         + f". Hysteresis is compensated with a ratio of {MAX_HYSTERESIS_RATIO:g} and the exact friction model.",
-        f"**Without friction**, no joint reaches a limit within {FRICTIONLESS_DURATION:g} s at {staying[0]} (paper's) "
-        f"and {staying[1]} (ours) of {few} poses, because a small torque error accelerates the wrist by tens of "
-        "rad/s^2. With damping (`control --mode damped`), each drift rate is the torque error divided by the damping.",
     )
     tables = (
         _drift_table("fig5", "all torques on", drifts, PAPER.figure_5, PAPER.figure_5_means),
         _torque_table(session),
-        _rate_table(frictionless),
     )
     plots = _plots("fig5", "all torques on", ours, paper, PAPER.figure_5, PAPER.figure_5_means)
     title = "Fig. 5: drift after release, all torques"
@@ -106,9 +90,9 @@ def reproduce_figure_6(session: ReproductionSession) -> Section:
 
 
 def reproduce_psm(session: ReproductionSession) -> Section:
-    """Compares the paper's model of the PSM with ours, and simulates releases of a PSM."""
+    """Simulates releases of a PSM with the nominal model and with ours."""
     psm, few = session.psm, session.sample_sizes.few_releases
-    nominal_model = IdentifiedModel.from_arm(session.nominal(psm.arm))
+    nominal_model = IdentifiedModel.from_arm(load_arm(psm.arm.source))
     ours = session.release(psm, psm.model, few, "releasing ours")
     nominal = session.release(psm, nominal_model, few, "releasing the nominal model")
     drifts = {"the nominal model": nominal, OURS: ours}
@@ -120,7 +104,6 @@ def reproduce_psm(session: ReproductionSession) -> Section:
     plot = largest_drifts_plot("psm_release", "PSM", {name: (COLOURS[name], d) for name, d in drifts.items()})
     blocks: list[Block] = [
         _finding(ours, nominal, "the nominal model"),
-        _mechanism_table(session.nominal(psm.arm)),
         _drift_table("psm_release", "PSM", drifts),
         plot,
         remark,
@@ -129,26 +112,6 @@ def reproduce_psm(session: ReproductionSession) -> Section:
 
 
 COLOURS = {PAPERS: REFERENCE, "the nominal model": REFERENCE, OURS: FITTED}
-
-
-def _mechanism_table(arm: Arm) -> Table:
-    """Compares the file of the paper with the PSM of this package. Drake rejects the file of the paper."""
-    remote, angle = mechanism_errors(arm, PAPER.remote_axis, PAPER.wrist_axes)
-    plant = make_arm_plant(arm, closure="ball")
-    yaw, mass = arm.joint_names.index(PAPER.locked_joint), plant.CalcTotalMass(plant.CreateDefaultContext())
-    rows = (
-        ("loops of the linkage", "links with two parents: Finalize() rejects the file", "loop-closure constraints"),
-        (
-            "remote centre of motion",
-            "not exact: the front four-bar has bars of 0.530 and 0.535 m, ends of 0.0370 and 0.0407 m",
-            f"error {remote:.0e} m at {AXIS_POSES} random poses",
-        ),
-        ("wrist yaw axis", "identical to the wrist pitch axis", f"{np.degrees(angle):.1f} degrees from it"),
-        ("yaw", "locked by its limits", f"{arm.position_lower[yaw]:+.3f}..{arm.position_upper[yaw]:+.3f} rad"),
-        ("inertias", "1 kg m^2 each, centres of mass at the origins", f"from shapes, total mass {mass:.2f} kg"),
-        ("prismatic joint", "all 15 joints revolute in the file, one prismatic in the text", "one of 7 joints"),
-    )
-    return Table(("", "file of the paper", "ours"), rows, "Models of the PSM", name="psm")
 
 
 def _drift_table(
@@ -200,19 +163,6 @@ def _torque_table(session: ReproductionSession) -> Table:
     return Table(("", *JOINTS), rows, caption, name="fig5_torques")
 
 
-def _rate_table(releases: Mapping[str, Drifts]) -> Table:
-    """Returns a table of drift rates in the first, the last and the worst interval of length `RATE_TIME`."""
-    window, rows = round(RATE_TIME / SAMPLE_PERIOD), []
-    for label, drifts in releases.items():
-        q = drifts.positions
-        rate = np.abs(q[:, window:] - q[:, :-window]) / RATE_TIME
-        rows.append((f"{label}: first second, median", *numbers(np.median(rate[:, 0], axis=0), ".3f")))
-        rows.append((f"{label}: last second, median", *numbers(np.median(rate[:, -1], axis=0), ".3f")))
-        rows.append((f"{label}: any second, largest", *numbers(rate.max(axis=(0, 1)), ".3f")))
-    caption = "Drift rate without friction, averaged over one second [rad/s]"
-    return Table(("", *JOINTS), rows, caption, name="fig5_without_friction")
-
-
 def _finding(ours: Drifts, other: Drifts, whose: str) -> Text:
     return Text(
         f"All joints stay within {_band(ours.arm)} at {share(ours.num_held, len(ours.positions))} of the poses with "
@@ -235,15 +185,6 @@ def _failed(drifts: Drifts) -> str:
     """Returns the joints that were not held, each with the number of such releases, and the largest drift."""
     lost = [f"{joint} ({n})" for joint, n in zip(JOINTS, np.sum(~drifts.held, axis=0), strict=True) if n]
     return f"{', '.join(lost) or 'none'}, largest drift {1e3 * drifts.largest.max():.0f} mrad"
-
-
-def _num_staying(drifts: Drifts) -> int:
-    """Returns the number of releases in which no joint moves to one of its limits."""
-    arm, q = drifts.arm, drifts.positions
-    edge = arm.per_joint(*BAND)
-    inside = (q > arm.position_lower + edge) & (q < arm.position_upper - edge)
-    ran = ~inside & (np.abs(q - q[:, :1]) > 2 * edge)
-    return int(np.count_nonzero(~np.any(ran, axis=(1, 2))))
 
 
 def _plots(
