@@ -205,7 +205,7 @@ def test_joint_is_held_if_it_never_leaves_band():
 def truth(tmp_path_factory):
     """Ground-truth arm, derived and compiled once."""
     arm = perturbed_arm(ARM, tmp_path_factory.mktemp("truth") / "mtm.sdf", 8, without=PAPER.without)
-    return IdentifiedArm(arm, "", Recording(q=np.zeros((1, 7))), IdentifiedModel.from_arm(ARM))
+    return IdentifiedArm(arm, Recording(q=np.zeros((1, 7))), IdentifiedModel.from_arm(ARM))
 
 
 @pytest.mark.slow
