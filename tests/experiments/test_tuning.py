@@ -222,23 +222,6 @@ def test_design_keeps_margins_and_reports_limitation():
     assert delayed.frequency < 0.8 * design_joint(joint, sampling).frequency
 
 
-def test_mass_matrix_includes_linkage_and_rotors():
-    # For a motion of the independent joints, the kinetic energy of the whole tree is v' M v / 2.
-    from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_selector
-
-    arm = load_arm("mtml")
-    generator = np.random.default_rng(4)
-    q, v = arm.sample_poses(1, generator)[0], generator.normal(size=7)
-    (M,) = mass_matrices(arm, [q])
-    plant = make_arm_plant(arm)
-    context = plant.CreateDefaultContext()
-    set_arm_positions(plant, context, arm, q)
-    v_plant = np.zeros(plant.num_velocities())
-    v_plant[tree_selector(plant, arm)] = arm.linkage.matrix @ v
-    plant.SetVelocities(context, v_plant)
-    assert 0.5 * v @ M @ v == pytest.approx(plant.CalcKineticEnergy(context), rel=1e-9)
-
-
 def test_measures_of_known_step():
     arm = load_arm("psm")
     n, t = arm.num_joints, 1e-3 * np.arange(round(1e3 * DURATION) + 1)

@@ -10,7 +10,7 @@ from dvrk_drake.dynamics.kinematics import ArmFrame
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm_files import known_arms, load_arm
 from dvrk_drake.models.inverse_kinematics import inverse_kinematics
-from dvrk_drake.models.plant import holding_torque, make_arm_plant, set_arm_positions, tree_selector
+from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_selector
 
 pytestmark = pytest.mark.drake_api
 
@@ -103,23 +103,6 @@ def test_motor_4_couples_elbow_and_platform(plant):
         np.testing.assert_allclose(difference[1:4, 1:4], 0.5 * I_Bo[2, 2] * np.outer(J_4, J_4)[1:4, 1:4], atol=1e-12)
         assert np.linalg.eigvalsh(full).min() > 0
     assert I_Bo[2, 2] == pytest.approx(10.53**2 * 1e-6, rel=1e-4)
-
-
-@pytest.mark.parametrize("name", ["mtml", "psm"])
-def test_holding_torque_is_the_gradient_of_potential_energy(name):
-    arm = load_arm(name)
-    plant = make_arm_plant(arm)
-    context = plant.CreateDefaultContext()
-
-    def energy(q):
-        set_arm_positions(plant, context, arm, q)
-        return plant.CalcPotentialEnergy(context)
-
-    h = 1e-5
-    for q in poses(arm):
-        gradient = [(energy(q + h * e) - energy(q - h * e)) / (2 * h) for e in np.eye(7)]
-        set_arm_positions(plant, context, arm, q)
-        np.testing.assert_allclose(holding_torque(plant, context, arm), gradient, atol=1e-8)
 
 
 def test_transmission_conserves_power():

@@ -130,8 +130,6 @@ def test_playing_animation_moves_the_cursor(opened):
     assert opened.page.locator(".time").text_content() == stopped
 
 
-
-
 def test_copy_button_copies_the_command(opened):
     opened, _ = opened
     opened.page.context.grant_permissions(["clipboard-read", "clipboard-write"])

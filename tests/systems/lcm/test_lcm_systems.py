@@ -109,18 +109,6 @@ def test_the_status_echoes_the_last_accepted_command():
     assert command.session_id == status.session_id != 0
 
 
-def test_first_of_two_controllers_stays_in_control():
-    lcm = DrakeLcm("memq://")
-    arm, first, second = SimulatedArm(lcm), Controller(lcm), Controller(lcm)
-    run(lcm, 300, arm, first)
-    sender, begun = arm.statuses[-1].command_sender_id, len(arm.statuses)
-    run(lcm, 300, arm, first, second)
-    assert {(s.guard_state, s.command_sender_id) for s in arm.statuses[begun:]} == {(Status.STATE_EFFORT, sender)}
-    assert arm.statuses[-1].num_ignored >= 290
-    assert arm.statuses[-1].ignored_code == Status.REFUSAL_OTHER_SENDER
-    assert arm.drift() < 1e-3
-
-
 def test_second_gravity_compensation_is_refused_at_start():
     lcm = DrakeLcm("memq://")
     driver = DvrkDriver(gravity_compensation=True)
