@@ -12,7 +12,7 @@ from cyclopts import Parameter
 
 import dvrk_drake as dvrk
 from dvrk_drake.cli import options, support
-from dvrk_drake.cli.report import Results
+from dvrk_drake.cli.support import Results
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.workers import local_executor
 

@@ -10,7 +10,7 @@ from cyclopts import Parameter, Token
 
 import dvrk_drake as dvrk
 from dvrk_drake.cli import options, support
-from dvrk_drake.cli.report import Results, ResultsAndJson
+from dvrk_drake.cli.support import Results, ResultsAndJson
 from dvrk_drake.errors import ModelError, RecordingError
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from cyclopts import Group, Parameter
 
 import dvrk_drake as dvrk
 from dvrk_drake.cli import options, support
-from dvrk_drake.cli.report import ResultsAndJson
+from dvrk_drake.cli.support import ResultsAndJson
 from dvrk_drake.errors import DvrkDrakeError, ModelError
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
-from cyclopts import App, ArgumentCollection, Group, Parameter, Token
+from cyclopts import App, ArgumentCollection, Group, Parameter, Token, validators
 
 import dvrk_drake as dvrk
 from dvrk_drake.errors import DvrkDrakeError, RecordingError
@@ -66,11 +66,6 @@ def whole_number(_: object, tokens: Sequence[Token]) -> int:
         return int(tokens[0].value)
     except ValueError:
         raise ValueError(f'must be a whole number, not "{tokens[0].value}"') from None
-
-
-def _check_seed(_: object, value: int) -> None:
-    if value < 0:
-        raise ValueError("must be a whole number, 0 or larger")
 
 
 def one_of(title: str) -> Group:
@@ -183,7 +178,11 @@ Overwrite = Annotated[
 Verbose = Annotated[bool, Parameter(alias="-v", show_default=False, help="Print all details.")]
 Seed = Annotated[
     int,
-    Parameter(converter=whole_number, validator=_check_seed, help="Seed of the random number generator, 0 or larger."),
+    Parameter(
+        converter=whole_number,
+        validator=validators.Number(gte=0),
+        help="Seed of the random number generator, 0 or larger.",
+    ),
 ]
 Seconds = Annotated[float, Parameter(metavar="S", validator=_check_seconds)]
 Port = Annotated[int | None, Parameter(converter=whole_number, help="TCP port of the web page. Default: a free port.")]

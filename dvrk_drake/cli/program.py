@@ -38,6 +38,7 @@ from dvrk_drake.cli.support import (
     folders_only_for_results,
     import_interruptibly,
     print_next_step,
+    print_warning,
     suggest,
 )
 from dvrk_drake.errors import DvrkDrakeError
@@ -45,12 +46,6 @@ from dvrk_drake.errors import DvrkDrakeError
 # The matrices are small. Several BLAS threads would mostly wait for each other: minutes on a busy computer.
 # The variable must be set before numpy is imported, which happens in the commands.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-#: Mapping from required options to the accepted values, for the message of a missing option.
-REQUIRED = {
-    "--arm": ": ecm, ecm_si, mtml, mtmr, psm, psm_si, or the path of a YAML, URDF, SDF or MJCF file",
-    "--model": ": the model file that identify wrote",
-}
 
 
 def reflow_help() -> None:
@@ -87,7 +82,7 @@ def run(arguments: Sequence[str] | None) -> int:
             gc.enable()
             signal.signal(signal.SIGINT, signal.default_int_handler)
         with folders_only_for_results(), warnings.catch_warnings():
-            warnings.showwarning = _print_warning
+            warnings.showwarning = lambda message, *_, **__: print_warning(str(message))
             suggest("")
             try:
                 command(*bound.args, **bound.kwargs)
@@ -110,10 +105,6 @@ def run(arguments: Sequence[str] | None) -> int:
     return 0
 
 
-def _print_warning(message: Warning | str, *_: object, **__: object) -> None:
-    print(f"dvrk-drake: warning: {message}", file=sys.stderr)
-
-
 def _usage_error(error: CycloptsError, words: Sequence[str]) -> str:
     """Returns a usage error in one line."""
     name = " ".join(error.command_chain or [])
@@ -124,7 +115,7 @@ def _usage_error(error: CycloptsError, words: Sequence[str]) -> str:
     elif isinstance(error, CoercionError):
         message = re.sub(r': unable to convert (".*") into float$', r": must be a number, not \1", message)
     elif isinstance(error, ValidationError):
-        message = error.exception_message if error.group else message.replace(". must", ": must")
+        message = error.exception_message if error.group else re.sub(r"\. [Mm]ust", ": must", message)
     elif isinstance(error, UnusedCliTokensError):
         message = f"Unexpected argument: {' '.join(error.unused_tokens or [])}"
     elif isinstance(error, MissingArgumentError) and error.argument and error.argument.name in options:
@@ -138,7 +129,7 @@ def _usage_error(error: CycloptsError, words: Sequence[str]) -> str:
             message += f", before {' and '.join(long)}"
         if suggestion:
             message += f". {suggestion[0]}"
-        else:
-            message += REQUIRED.get(error.argument.name, "")
+        elif error.argument.parameter.help:
+            message += f": {error.argument.parameter.help.rstrip('.')}"
     see = " See" if message.endswith("?") else "; see"
     return f"dvrk-drake: error: {message}{see} {f'dvrk-drake {name}'.rstrip()} --help"

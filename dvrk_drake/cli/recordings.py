@@ -9,7 +9,7 @@ from cyclopts import Parameter
 
 import dvrk_drake as dvrk
 from dvrk_drake.cli import options, support
-from dvrk_drake.cli.report import ResultsAndJson
+from dvrk_drake.cli.support import ResultsAndJson
 from dvrk_drake.errors import ModelError, RecordingError
 
 _FILE = options.FileOptions()

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
-from cyclopts import Parameter
+from cyclopts import Parameter, validators
 
 import dvrk_drake as dvrk
 from dvrk_drake.cli import options, support
-from dvrk_drake.cli.report import Results
+from dvrk_drake.cli.support import Results
 from dvrk_drake.errors import ScenarioError, StudyError
 from dvrk_drake.progress import step_progress
 
@@ -76,11 +76,6 @@ def _set_options(values: Sequence[str] | None) -> str:
     return "".join(f" --set {shlex.quote(value)}" for value in values or ())
 
 
-def _check_workers(_: object, value: int | None) -> None:
-    if value is not None and not 1 <= value <= 1024:
-        raise ValueError("must be a number of processes from 1 to 1024")
-
-
 @options.simulate.command
 def study(
     study: str,
@@ -89,7 +84,7 @@ def study(
     output: Annotated[str, Parameter(metavar="RESULTS.csv")],
     set: options.Set = None,
     workers: Annotated[
-        int | None, Parameter(metavar="N", converter=options.whole_number, validator=_check_workers)
+        int | None, Parameter(metavar="N", converter=options.whole_number, validator=validators.Number(gte=1, lte=1024))
     ] = None,
     results: Results = _RESULTS,
 ) -> None:

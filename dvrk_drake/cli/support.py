@@ -1,4 +1,4 @@
-"""Functions that all commands share: checks of output paths, progress display, and handling of Ctrl-C."""
+"""Functions of all commands: checks of output paths, progress display, handling of Ctrl-C, and output of results."""
 
 from __future__ import annotations
 
@@ -15,9 +15,11 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
+from cyclopts import Parameter
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -49,18 +51,12 @@ def import_interruptibly() -> None:
     """Imports the modules that all commands need, so that Ctrl-C during the import ends the process at once.
 
     Without this function, Ctrl-C prints a traceback while an extension module is imported. No file is partly written at
-    that time. The function does nothing in a thread, or if the modules are imported already.
+    that time.
     """
-    # This module imports all slow modules that the commands need.
-    modules = ("dvrk_drake.reports.identification",)
-    if threading.current_thread() is not threading.main_thread() or sys.modules.keys() >= set(modules):
-        return
-
     with interrupt_ends_process():
-        for module in modules:
-            importlib.import_module(module)
-        # Importing Drake sets the log level.
-        logging.getLogger("drake").setLevel(logging.WARNING)
+        importlib.import_module("dvrk_drake.reports.identification")  # imports all slow modules
+    # Importing Drake sets the log level.
+    logging.getLogger("drake").setLevel(logging.WARNING)
 
 
 @contextmanager
@@ -127,9 +123,6 @@ def _refuse_twice(path: str) -> None:
         raise DvrkDrakeError(f"{path}: is given for two outputs; choose a different path for one of them")
     _outputs.add(target)
 
-
-#: Maximum number of progress bars on a terminal. Finished steps are removed first.
-MAX_BARS = 6
 
 #: Words of the running command, without the name of the program.
 command_words: list[str] = []
@@ -378,10 +371,108 @@ class Steps:
             print(text, file=sys.stderr, flush=True)
         for task in self._progress.tasks:
             self._progress.update(task.id, total=1.0, completed=1.0)
-        if len(self._progress.tasks) >= MAX_BARS:
-            oldest = next(iter(self._tasks))
-            self._progress.remove_task(self._tasks.pop(oldest))
         self._tasks[step] = self._progress.add_task(text, total=None)
 
     def __exit__(self, *_: object) -> None:
         self._progress.stop()
+
+
+Report = Annotated[
+    str | None, Parameter(metavar="FILE.html", help="Write a report, one HTML file that needs no network.")
+]
+Plots = Annotated[
+    str | None, Parameter(metavar="FOLDER", help="Write figures into this folder, which must be new or empty.")
+]
+Json = Annotated[str | None, Parameter(metavar="FILE", help="Write the results as JSON.")]
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class Results:
+    """Options of all commands that show a result on a page."""
+
+    plots: Plots = None
+    report: Report = None
+    overwrite: options.Overwrite = False
+    verbose: options.Verbose = False
+
+    def check(self, *inputs: str | None, output: str | None = None) -> None:
+        """Checks all output paths before work begins, and creates the folder of the plots.
+
+        Args:
+            inputs: Paths of the input files. None or "": there is none.
+            output: Path of a further output. None: there is none.
+
+        Raises:
+            DvrkDrakeError: A path cannot be written, or is that of an input or of another output.
+        """
+        given = list(filter(None, inputs))
+        for path in filter(None, (output, self._json)):
+            check_output(path, *given, overwrite=self.overwrite)
+        if self.report is not None:
+            if not self.report.lower().endswith((".html", ".htm")):
+                raise DvrkDrakeError(f"{self.report}: --report writes HTML; the name of the file must end in .html")
+            check_output(self.report, *given, overwrite=self.overwrite)
+        # Modules that the results need are imported before the work begins, so that Ctrl-C ends the import at once.
+        with interrupt_ends_process():
+            if self.report is not None:
+                importlib.import_module("dvrk_drake.reports.html_file")
+            if self.plots is not None:
+                importlib.import_module("dvrk_drake.reports.image_files")
+        if self.plots is not None:
+            new_folder(self.plots, overwrite=self.overwrite)
+
+    def show(
+        self,
+        page: Page,
+        *inputs: str | None,
+        content: object = None,
+        note: str = "",
+        warnings: Sequence[Finding] = (),
+        saved: str | None = None,
+    ) -> None:
+        """Writes the JSON file, prints the page and the warnings, and writes the plots and the report.
+
+        Args:
+            page: Page of the result.
+            inputs: Paths of the input files. None or "": there is none.
+            content: Content of the JSON file.
+            note: Note on the result to print. "": there is none.
+            warnings: Warnings to print.
+            saved: Path of an output that was written already. None: there is none.
+        """
+        from dvrk_drake.reports.terminal import make_console
+
+        # Results are saved before printing, because the reader of the output (e.g. head) may close the pipe.
+        if self._json is not None:
+            write_json(self._json, content)
+        show_page(page, verbose=self.verbose)
+        console = make_console()
+        if note:
+            console.print(note)
+        print_warnings(console, warnings)
+        for path in filter(None, (saved, self._json)):
+            print_written(path)
+        if self.plots is not None:
+            from dvrk_drake.reports.image_files import write_images
+
+            if write_images(page, Path(self.plots)):
+                print_written(self.plots)
+        if self.report is not None:
+            from dvrk_drake.reports.html_file import write_html
+
+            with Steps("writing the report"):
+                write_html(page, self.report, list(filter(None, inputs)), command_words)
+            print_written(self.report, "report")
+
+    @property
+    def _json(self) -> str | None:
+        return getattr(self, "json", None)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class ResultsAndJson(Results):
+    """Options of the commands that also write their result as JSON."""
+
+    json: Json = None
