@@ -44,7 +44,7 @@ from dvrk_drake.dynamics.inertial_parameters import pseudo_inertia
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.formats import read_recording
 from dvrk_drake.recordings.recording import Recording
 
 #: Published errors [%] per joint: on the motion of the fit, and on another motion.

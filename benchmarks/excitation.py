@@ -26,9 +26,8 @@ from timing import print_table
 
 import dvrk_drake as dvrk
 from dvrk_drake.analysis.excitation.design import design_excitation
-from dvrk_drake.analysis.excitation.information import MotionInformation
+from dvrk_drake.analysis.excitation.information import MotionInformation, random_motion, state_of
 from dvrk_drake.analysis.excitation.motion_limits import MotionLimits
-from dvrk_drake.analysis.excitation.random_motion import random_motion, state_of
 from dvrk_drake.analysis.motion_identification import identify_dynamic
 from dvrk_drake.analysis.motion_validation import validate_motion
 from dvrk_drake.analysis.observations.observations import Observations

@@ -37,9 +37,9 @@ from pydrake.trajectories import PiecewisePolynomial
 from timing import print_table
 
 from dvrk_drake.analysis.excitation.design import design_excitation
+from dvrk_drake.analysis.excitation.information import random_motion
 from dvrk_drake.analysis.excitation.motion_limits import MotionLimits
 from dvrk_drake.analysis.excitation.periodic_motion import PeriodicMotion
-from dvrk_drake.analysis.excitation.random_motion import random_motion
 from dvrk_drake.analysis.identification import identify
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.kinematics import ArmFrame, Contact

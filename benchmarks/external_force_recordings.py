@@ -24,7 +24,7 @@ from dvrk_drake.analysis.identification import identify
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.dynamics.kinematics import ArmFrame, Contact
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.formats import read_recording
 
 #: File, link, mass [kg], and position in the link's frame [m]; see docs/payload.md for the source of the positions.
 CASES = [

@@ -13,7 +13,7 @@ import time
 import numpy as np
 
 import dvrk_drake as dvrk
-from dvrk_drake.recordings.writing import SAMPLES_FOLDER
+from dvrk_drake.recordings.formats import SAMPLES_FOLDER
 
 RATE, NOISE = 200.0, 0.05
 

@@ -24,7 +24,7 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 
 import dvrk_drake as dvrk
-from dvrk_drake.recordings.writing import SAMPLES, SAMPLES_FOLDER
+from dvrk_drake.recordings.formats import SAMPLES, SAMPLES_FOLDER
 from dvrk_drake.systems.arm_station import ArmStation
 
 ARMS = ("mtml", "psm", "psm_si", "ecm", "ecm_si")

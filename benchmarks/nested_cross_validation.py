@@ -19,7 +19,7 @@ from dvrk_drake.analysis.motion_identification import motion_problem
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.analysis.observations.repetition import FOLDS
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.formats import read_recording
 
 
 def main() -> None:

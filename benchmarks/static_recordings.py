@@ -24,7 +24,7 @@ from dvrk_drake.analysis.validation import validate_static
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.formats import read_recording
 from dvrk_drake.recordings.recording import Recording
 
 

@@ -22,8 +22,7 @@ from typing import Any
 import numpy as np
 
 import dvrk_drake as dvrk
-from dvrk_drake.analysis.excitation.information import MotionInformation
-from dvrk_drake.analysis.excitation.random_motion import random_motion, state_of
+from dvrk_drake.analysis.excitation.information import MotionInformation, random_motion, state_of
 
 Recordings = dict[str, tuple[dvrk.Recording, dvrk.Arm]]
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from dvrk_drake.analysis.recalibration import recalibrate
     from dvrk_drake.analysis.validation import predict, validate
     from dvrk_drake.dynamics.identified_model import IdentifiedModel
-    from dvrk_drake.dynamics.kinematics import Contact
+    from dvrk_drake.dynamics.kinematics import Contact, inverse_kinematics
     from dvrk_drake.errors import DvrkDrakeError
     from dvrk_drake.experiments.ground_truth import perturbed_arm, simulate_poses
     from dvrk_drake.experiments.scenario import Scenario, load_scenario
@@ -30,16 +30,14 @@ if TYPE_CHECKING:
     from dvrk_drake.models.arm import Arm
     from dvrk_drake.models.arm_files import load_arm
     from dvrk_drake.models.environment import Environment
-    from dvrk_drake.models.inverse_kinematics import inverse_kinematics
     from dvrk_drake.models.locked_joints import lock_joints
     from dvrk_drake.models.plant import add_arm, set_arm_positions
     from dvrk_drake.processes.arm_session import Dialog
     from dvrk_drake.processes.calibration import calibrate
     from dvrk_drake.processes.collector import CollectionSettings
     from dvrk_drake.processes.connection import ArmConnection, connect
-    from dvrk_drake.recordings.reading import read_recording
+    from dvrk_drake.recordings.formats import read_recording, write_recording, write_samples
     from dvrk_drake.recordings.recording import Recording
-    from dvrk_drake.recordings.writing import write_recording, write_samples
     from dvrk_drake.reports.html_file import write_report
     from dvrk_drake.systems.arm_drive import add_arm_drive
     from dvrk_drake.systems.arm_effects.dry_friction import PlantEffects
@@ -91,7 +89,7 @@ _MODULES = {
     "estimate_force": "analysis.external_force",
     "export_model": "export.model_export",
     "identify": "analysis.identification",
-    "inverse_kinematics": "models.inverse_kinematics",
+    "inverse_kinematics": "dynamics.kinematics",
     "load_arm": "models.arm_files",
     "lock_joints": "models.locked_joints",
     "load_scenario": "experiments.scenario",
@@ -99,16 +97,16 @@ _MODULES = {
     "payload": "analysis.payload",
     "perturbed_arm": "experiments.ground_truth",
     "predict": "analysis.validation",
-    "read_recording": "recordings.reading",
+    "read_recording": "recordings.formats",
     "recalibrate": "analysis.recalibration",
     "set_arm_positions": "models.plant",
     "simulate": "experiments.simulation",
     "simulate_poses": "experiments.ground_truth",
     "start_meshcat": "systems.arm_view.page",
     "validate": "analysis.validation",
-    "write_recording": "recordings.writing",
+    "write_recording": "recordings.formats",
     "write_report": "reports.html_file",
-    "write_samples": "recordings.writing",
+    "write_samples": "recordings.formats",
 }
 
 __all__ = [

@@ -12,7 +12,7 @@ import pytest
 from repository import ROOT
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.recordings.writing import SAMPLES_FOLDER
+from dvrk_drake.recordings.formats import SAMPLES_FOLDER
 
 pytestmark = pytest.mark.drake_api
 

@@ -41,9 +41,8 @@ from dvrk_drake.models.arm_schema import load_gains
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.models.sdf_model import MODELS_FOLDER, PACKAGE_URL
 from dvrk_drake.processes.simulated_arm import load_driver
-from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.formats import convert, read_recording, write_recording
 from dvrk_drake.recordings.recording import Recording
-from dvrk_drake.recordings.writing import convert, write_recording
 
 #: Factor of the number of examples. With a factor above 1, each run draws new examples.
 EXAMPLE_FACTOR = int(os.environ.get("DVRK_DRAKE_FUZZ", "1"))

@@ -30,7 +30,7 @@ from dvrk_drake.experiments.ground_truth import collect
 from dvrk_drake.experiments.simulation import advance, sample_times, samples
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.progress import step_progress
-from dvrk_drake.recordings.writing import SAMPLES, SAMPLES_FOLDER
+from dvrk_drake.recordings.formats import SAMPLES, SAMPLES_FOLDER
 
 #: Seed of the masses, poses, motions and noise. Number of poses.
 SEED, POSES = 18, 60

@@ -13,19 +13,24 @@ from scipy.stats import t as student
 
 from dvrk_drake.analysis.check.mounting import find_mounting, is_assumed
 from dvrk_drake.analysis.check.recording_check import require_usable, with_power
-from dvrk_drake.analysis.effects_at_rest import MIN_NUM_POSES, with_effects_at_rest
 from dvrk_drake.analysis.estimation.pose_effects import BASE_PRIOR, StaticProblem, candidate_effects
 from dvrk_drake.analysis.estimation.robust_fit import FOLDS, blocks, robust_fit
 from dvrk_drake.analysis.motion_identification import DynamicIdentification, identify_dynamic
 from dvrk_drake.analysis.observations.finding import Finding
 from dvrk_drake.analysis.observations.observations import Observations, Poses
 from dvrk_drake.analysis.observations.static_poses import find_excluded, usable_measurements, usable_poses
-from dvrk_drake.analysis.pose_identification import Method, StaticIdentification, identify_static
+from dvrk_drake.analysis.pose_identification import (
+    MIN_NUM_POSES,
+    Method,
+    StaticIdentification,
+    identify_static,
+    with_effects_at_rest,
+)
 from dvrk_drake.analysis.results import unexplained_effort
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect, effect_column
-from dvrk_drake.dynamics.base_parameters import independent_columns
 from dvrk_drake.dynamics.dynamic_model import ROUNDING_EFFORT
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+from dvrk_drake.dynamics.gravity_parameters import independent_columns
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import DvrkDrakeError, IdentificationError, RecordingError
 from dvrk_drake.models.arm import Arm

@@ -259,7 +259,7 @@ def compare(
     Args:
         file: Gravity-compensation file (gc-*.json) of the dVRK controller.
     """
-    from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation
+    from dvrk_drake.export.dvrk_mtm_gravity_compensation import compare_compensation
     from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
     from dvrk_drake.reports.export import compensation_page
 

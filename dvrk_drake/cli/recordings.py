@@ -24,7 +24,7 @@ def samples(folder: str, /, *, overwrite: options.Overwrite = False) -> None:
     Args:
         folder: Folder to write to, which must be new or empty.
     """
-    from dvrk_drake.recordings.writing import SAMPLES
+    from dvrk_drake.recordings.formats import SAMPLES
 
     target = support.new_folder(folder, overwrite=overwrite)
     with support.Steps("writing") as steps:
@@ -117,7 +117,7 @@ def convert(
         arm: Convert to joint coordinates of this arm. Required for bags, LeRobot data sets and files of the cisst
             collector.
     """
-    from dvrk_drake.recordings.writing import convert as convert_recording
+    from dvrk_drake.recordings.formats import convert as convert_recording
 
     support.check_output(output, recording, overwrite=overwrite)
     if arm is None and locked is not None:

@@ -12,8 +12,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform
 
-from dvrk_drake.dynamics.base_parameters import BaseParameters, StandardParameter, reduce_to_base
-from dvrk_drake.dynamics.gravity_parameters import link_frames, named_lengths, preference_order
+from dvrk_drake.dynamics.gravity_parameters import (
+    BaseParameters,
+    StandardParameter,
+    link_frames,
+    named_lengths,
+    preference_order,
+    reduce_to_base,
+)
 from dvrk_drake.dynamics.inertial_parameters import (
     PARAMETER_NAMES,
     LinkInertia,

@@ -1,11 +1,13 @@
-"""Forward kinematics of a frame of an arm, and its Jacobian for a contact force."""
+"""Forward and inverse kinematics of a frame of an arm, and the force at a point of contact."""
 
 from __future__ import annotations
 
+from itertools import product
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import JacobianWrtVariable
 
@@ -125,6 +127,118 @@ class ArmFrame:
         positions = np.empty(self._plant.num_positions())
         positions[self._selector] = self._arm.linkage.position(q)
         self._plant.SetPositions(self._context, positions)
+
+
+#: Number of start positions of each wrist joint. Within the limits of a wrist, each equation has at most two roots.
+#: Five starts find no other solutions for 120 random poses of a PSM with a needle driver and with a stapler.
+_STARTS = 3
+#: Distance of the hand frame from the remote centre [m] below which yaw, pitch and roll are not determined.
+_AT_CENTER = 1e-6
+#: Distance of two solutions that are equal [rad, m].
+_SAME = 1e-7
+
+
+def inverse_kinematics(arm: Arm, X_BF: RigidTransform, rest: ArrayLike | None = None) -> NDArray[np.float64]:
+    """Returns all poses (k, n) within the limits in which the hand frame F has a pose in the base frame.
+
+    The arm moves its shaft with yaw, pitch, insertion and roll, and has no or two wrist joints behind it, as an ECM and
+    a PSM with any instrument. The position error is less than 1e-9 m. `ArmFrame.solve` finds one solution near a
+    pose, for every arm. Threads must not share an arm.
+
+    Args:
+        arm: Arm with the frames `remote_center` and `shaft`.
+        X_BF: Pose of the frame `arm.frames.hand` in the base frame.
+        rest: Pose (n,) with the positions of joints that do not move the hand frame, e.g. the jaw [rad, m]. None: zero,
+            or the limit nearest to zero.
+
+    Returns:
+        Poses, ordered by their distance from `rest`. There is none if the pose is not reachable, or if its origin is at
+        the remote centre, where the solution is not unique.
+
+    Raises:
+        ArmError: The arm has no such shaft, or `rest` has another number of elements.
+
+    Example:
+        >>> import dvrk_drake as dvrk
+        >>> from pydrake.math import RigidTransform, RollPitchYaw
+        >>> arm = dvrk.load_arm("psm_si", "PROGRASP_FORCEPS_420093")
+        >>> poses = dvrk.inverse_kinematics(arm, RigidTransform(RollPitchYaw(3.1, 0.2, 1.5), [0.02, 0.03, -0.12]))
+        >>> [round(float(q), 3) for q in poses[0]]
+        [0.167, -0.282, 0.131, 0.04, 0.491, -0.117, 0.0]
+    """
+    hand, shaft = ArmFrame(arm), _Shaft(arm)
+    lower, upper = arm.position_lower, arm.position_upper
+    base = np.zeros(arm.num_joints) if rest is None else np.asarray(rest, dtype=np.float64)
+    if base.shape != (arm.num_joints,):
+        raise ArmError(f"{arm.name}: rest has the shape {base.shape}; allowed: ({arm.num_joints},), one per joint")
+    base = np.clip(base, lower, upper)
+    wrists = product(*np.linspace(lower[shaft.wrist], upper[shaft.wrist], _STARTS).T)
+    found: list[NDArray[np.float64]] = []
+    for wrist in wrists if np.linalg.norm(X_BF.inverse() @ shaft.center) > _AT_CENTER else ():
+        q = base.copy()
+        q[shaft.wrist] = wrist
+        # The shaft with this wrist misses the remote centre in general, but is near a solution for some of the starts.
+        for of_shaft in shaft.positions(X_BF @ hand.pose(q).inverse() @ shaft.pose(q)):
+            q[:4] = of_shaft
+            solution = hand.solve(X_BF, q)
+            for turn in 2 * np.pi * np.arange(-2, 3) if solution is not None else ():
+                turned = solution + turn * np.eye(arm.num_joints)[3]
+                inside = np.all((turned >= lower - _SAME) & (turned <= upper + _SAME))
+                if inside and not any(np.allclose(turned, other, rtol=0, atol=_SAME) for other in found):
+                    found.append(np.clip(turned, lower, upper))
+    found.sort(key=lambda q: float(np.linalg.norm(q - base)))
+    return np.array(found).reshape(-1, arm.num_joints)
+
+
+class _Shaft(ArmFrame):
+    """Shaft that yaw, pitch, insertion and roll move about a remote centre.
+
+    Attributes:
+        center: Position (3,) of the remote centre in the base frame [m].
+        wrist: Indices of the joints behind the shaft that move the hand frame.
+    """
+
+    def __init__(self, arm: Arm) -> None:
+        super().__init__(arm, arm.frames.shaft)
+        home = np.zeros(arm.num_joints)
+        axes = self.jacobian(home).T[:4]
+        is_complete = bool(arm.frames.remote_center and arm.frames.shaft)
+        if not (is_complete and np.allclose(np.linalg.norm(axes[:, :3], axis=1), [1, 1, 0, 1], rtol=0, atol=1e-9)):
+            raise ArmError(
+                f"{arm.name}: the arm has no shaft that yaw, pitch, insertion and roll move about a fixed point"
+            )
+        moves_hand = np.any(np.abs(ArmFrame(arm).jacobian(home)) > 1e-9, axis=0)
+        self.wrist = np.flatnonzero(moves_hand & (np.arange(arm.num_joints) >= 4))
+        if len(self.wrist) not in (0, 2):
+            count = len(self.wrist)
+            raise ArmError(f"{arm.name}: {count} joints behind the shaft move the hand frame; allowed: 0 or 2")
+        self.center = ArmFrame(arm, arm.frames.remote_center).pose(home).translation()
+        X_BS = self.pose(home)
+        self._R_BS, self._yaw, self._pitch = X_BS.rotation().matrix(), axes[0, :3], axes[1, :3]
+        along = self._R_BS[:, 2]
+        self._insertion_sign, self._roll_sign = np.sign(axes[2, 3:] @ along), np.sign(axes[3, :3] @ along)
+        self._home_depth = float((X_BS.translation() - self.center) @ along)
+
+    def positions(self, X_BS: RigidTransform) -> list[NDArray[np.float64]]:
+        """Returns both solutions (4,) for yaw, pitch, insertion and roll, with which the shaft has a pose."""
+        yaw, pitch = self._yaw, self._pitch
+        d_home, d = self._R_BS[:, 2], X_BS.rotation().col(2)
+        depth = float((X_BS.translation() - self.center) @ d)
+        insertion = self._insertion_sign * (depth - self._home_depth)
+        # The shaft has the direction cos(pitch) d_home + sin(pitch) side before the yaw turns it.
+        side = np.cross(pitch, d_home)
+        sine = float(np.clip(d @ yaw / (side @ yaw), -1.0, 1.0))
+        solutions = []
+        for angle in (np.arcsin(sine), np.pi - np.arcsin(sine)):
+            before = np.cos(angle) * d_home + sine * side
+            first = np.arctan2(np.cross(before, d) @ yaw, before @ d - (before @ yaw) * (d @ yaw))
+            R_BS = AngleAxis(first, yaw).rotation() @ AngleAxis(angle, pitch).rotation() @ self._R_BS
+            R = R_BS.T @ X_BS.rotation().matrix()
+            roll = self._roll_sign * np.arctan2(R[1, 0], R[0, 0])
+            # The limits of yaw and pitch are within a half turn.
+            first, second = (np.remainder(x + np.pi, 2 * np.pi) - np.pi for x in (first, angle))
+            solutions.append(np.array([first, second, insertion, roll]))
+        return solutions
 
 
 #: Prior standard deviation of each component of a force [N]: the largest force for which the estimates were tested

@@ -26,7 +26,7 @@ from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
 from dvrk_drake.models.typed_yaml import load_yaml
 from dvrk_drake.progress import Progress, step_progress
-from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.formats import read_recording
 from dvrk_drake.recordings.recording import Recording
 
 #: Content of paper.yaml, by key. The comments of this file define the numbers.

@@ -1,4 +1,4 @@
-"""Conversion of an MTM's model to the gravity-compensation file of the dVRK's controller."""
+"""Converts a model of an MTM to the gravity-compensation file of the dVRK controller, and compares file and model."""
 
 from __future__ import annotations
 
@@ -22,10 +22,13 @@ from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import (
     controller_regressor,
     controller_torque,
     polynomial_columns,
+    unclipped_torque,
 )
 from dvrk_drake.export.gravity_compensation_loss import CompensationLoss, accepted_differences, make_loss
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_files import known_arms
 from dvrk_drake.models.effects_schema import EFFECT_KINDS, DriveEffect
+from dvrk_drake.models.files import Reportable
 
 #: Number of random poses at which the torques of file and model are compared.
 POSES = 20000
@@ -262,3 +265,167 @@ def _best_polynomial(effect: ActuatorEffect, arm: Arm, joint: int) -> NDArray[np
     series = chebyshev.chebfit(x, effect.column(along, 0 * along), ORDER)
     polynomial = Polynomial(chebyshev.cheb2poly(series))(Polynomial([-middle / half, 1 / half]))
     return np.resize(np.append(polynomial.coef, np.zeros(ORDER + 1)), ORDER + 1)
+
+
+#: Factors (7,) that convert joint positions and torques of an arm to those of its mirror image. The wrists of MTML and
+#: MTMR are mirror images.
+_MIRROR = np.array([-1.0, 1.0, 1.0, -1.0, 1.0, -1.0, -1.0])
+#: Joints with different torques on MTML and MTMR: shoulder_pitch, elbow_pitch and wrist_platform.
+_SIDE_JOINTS = slice(1, 4)
+#: Ratio below which the mirror image of the model fits clearly better: error of the mirror image / error of the model.
+#: For the four public files of MTMs, the error of a model of the wrong side is 1.8 to 2.1 times the error of a model of
+#: the correct side.
+_MAX_ERROR_RATIO = 0.8
+#: Smallest number of poses inside the file's sweep. If fewer poses are inside, model and mirror image are compared at
+#: all poses.
+_MIN_POSES = 200
+#: Smallest torque whose sign is compared, divided by the model's largest torque on the same joint.
+SIGN_SHARE = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class CompensationComparison(Reportable):
+    """Comparison of the torques of a file and a model at random poses within the joint limits.
+
+    Attributes:
+        file, model: File and model that are compared.
+        q: Poses (m, 7) [rad], inside the joint box and the coupled limits.
+        model_torque, file_torque, clipped_torque: Torques (m, 7) at rest [N m]. `file_torque` is not clipped to the
+            torque limits of the file.
+        clipped: Mask (m, 7), True where the torque of the file is clipped to a torque limit.
+        opposed: Mask (m, 7), True where the clipped torque of the file and the torque of the model have opposite signs,
+            and both exceed `SIGN_SHARE` times the model's largest torque. False for the last joint.
+        runaway: Mask (m, 7), True where the unclipped torque of the file is outside the model's torque range by more
+            than half of the width of this range. False for the last joint, which has no torque in the file.
+        in_sweep: Mask (m,), True for poses at which the first six joints are inside the file's sweep.
+        other_side: True if the mirror image of the model fits the file clearly better than the model. The file then
+            probably belongs to an arm of the other side (left or right).
+    """
+
+    file: GravityCompensationFile
+    model: IdentifiedModel
+    q: NDArray[np.float64]
+    model_torque: NDArray[np.float64]
+    file_torque: NDArray[np.float64]
+    clipped_torque: NDArray[np.float64]
+    clipped: NDArray[np.bool_]
+    opposed: NDArray[np.bool_]
+    runaway: NDArray[np.bool_]
+    in_sweep: NDArray[np.bool_]
+    other_side: bool
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Warnings about the file."""
+        warnings = []
+        if self.other_side:
+            warnings.append(
+                "the mirror image of the model fits better than the model. The file probably belongs to an arm of the "
+                f"other side (left or right), not to {self.model.arm.name}. Check ARM_NAME and the serial number"
+            )
+        limits = self.model.arm.effort_limits
+        clips = np.maximum(np.abs(self.file.torque_lower), np.abs(self.file.torque_upper))
+        weak = [
+            f"{MTM_JOINTS[j]} {clips[j]:.3g} N m (effort limit {limits[j]:.3g} N m)"
+            for j in np.flatnonzero(clips > limits)
+        ]
+        if weak:
+            warnings.append(
+                f"torque limits of the file are above the effort limits of the joints, so they do not protect the arm: "
+                f"{', '.join(weak)}. Correct safe_lower_torque_limit and safe_upper_torque_limit"
+            )
+        return tuple(warnings)
+
+    def rms_difference(self, chosen: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """Returns the RMS differences (7,) of the torques at the poses in a mask (m,) [N m], NaN if there are none."""
+        error = (self.clipped_torque - self.model_torque)[chosen]
+        return np.sqrt(np.mean(error**2, axis=0)) if len(error) else np.full(NUM_JOINTS, np.nan)
+
+    def as_dict(self) -> dict:
+        """Returns the comparison as a dictionary for JSON, with None instead of NaN. Shares are those of the poses."""
+        columns = {
+            "model_lower": self.model_torque.min(axis=0),
+            "model_upper": self.model_torque.max(axis=0),
+            "file_lower": self.file_torque.min(axis=0),
+            "file_upper": self.file_torque.max(axis=0),
+            "clip_lower": self.file.torque_lower,
+            "clip_upper": self.file.torque_upper,
+            "clipped": self.clipped.mean(axis=0),
+            "opposed": self.opposed.mean(axis=0),
+            "runaway": self.runaway.mean(axis=0),
+            "rms_inside": self.rms_difference(self.in_sweep),
+            "rms_outside": self.rms_difference(~self.in_sweep),
+        }
+        numbers = {key: [None if np.isnan(x) else float(x) for x in values] for key, values in columns.items()}
+        return {
+            "poses": len(self.q),
+            "other_side": self.other_side,
+            "share_in_sweep": float(self.in_sweep.mean()),
+            "joints": [{"name": name} | {k: x[j] for k, x in numbers.items()} for j, name in enumerate(MTM_JOINTS)],
+        }
+
+
+def compare_compensation(file: GravityCompensationFile, model: IdentifiedModel) -> CompensationComparison:
+    """Compares the torques of file and model at random poses, which are uniformly distributed within the joint limits.
+
+    Raises:
+        ModelError: The model is not of an MTM, or the file belongs to another arm.
+    """
+    arm = model.arm
+    arm.refuse_locked_joints("a comparison")
+    if arm.joint_names != MTM_JOINTS:
+        raise ModelError(f"{arm.name} is not an MTM; only the gravity-compensation file of an MTM can be compared")
+    known = [name.upper() for name in known_arms()]
+    if file.arm_name.upper() != arm.name.upper() and {file.arm_name.upper(), arm.name.upper()} <= set(known):
+        raise ModelError(
+            f"the file belongs to {file.arm_name} (ARM_NAME or file name), but the model belongs to {arm.name}. "
+            f"Use a model of {file.arm_name}, or correct ARM_NAME in the file"
+        )
+    q = _poses(arm)
+    tau_model, tau_raw, tau_clipped = model.holding_torque(q), unclipped_torque(file, q), controller_torque(file, q)
+    half_range = 0.5 * np.ptp(tau_model, axis=0)
+    threshold = SIGN_SHARE * np.abs(tau_model).max(axis=0)
+    clipped = tau_raw != tau_clipped
+    opposed = (tau_model * tau_clipped < 0) & (np.abs(tau_model) > threshold) & (np.abs(tau_clipped) > threshold)
+    runaway = (tau_raw < tau_model.min(axis=0) - half_range) | (tau_raw > tau_model.max(axis=0) + half_range)
+    # Excluded: joints without gravity torque, and the last joint, which the file does not compensate.
+    compared = (half_range > 1e-9) & (np.arange(NUM_JOINTS) < NUM_JOINTS - 1)
+    runaway, opposed = runaway & compared, opposed & compared
+    in_sweep = np.zeros(len(q), dtype=bool)
+    if file.sweep is not None:
+        # The torque of the file does not depend on the position of the last joint.
+        in_sweep = np.all(
+            (q >= file.sweep[0]) & (q <= file.sweep[1]), axis=1, where=np.arange(NUM_JOINTS) < NUM_JOINTS - 1
+        )
+    return CompensationComparison(
+        file,
+        model,
+        q,
+        tau_model,
+        tau_raw,
+        tau_clipped,
+        clipped,
+        opposed,
+        runaway,
+        in_sweep,
+        other_side=_is_of_other_side(model, q, tau_clipped, in_sweep),
+    )
+
+
+def _is_of_other_side(
+    model: IdentifiedModel, q: NDArray[np.float64], tau_file: NDArray[np.float64], in_sweep: NDArray[np.bool_]
+) -> bool:
+    """Returns whether the mirror image of the model fits the torque of a file clearly better than the model.
+
+    If at least `_MIN_POSES` poses are inside the file's sweep, only these poses are compared.
+    """
+    if np.count_nonzero(in_sweep) >= _MIN_POSES:
+        q, tau_file = q[in_sweep], tau_file[in_sweep]
+    unmirrored, mirrored = model.holding_torque(q), _MIRROR * model.holding_torque(_MIRROR * q)
+    return _side_error(tau_file, mirrored) < _MAX_ERROR_RATIO * _side_error(tau_file, unmirrored)
+
+
+def _side_error(tau_file: NDArray[np.float64], tau_model: NDArray[np.float64]) -> float:
+    """Returns the RMS torque error of `_SIDE_JOINTS`. Each joint's error is divided by its RMS torque in the file."""
+    size = np.sqrt(np.mean(tau_file[:, _SIDE_JOINTS] ** 2, axis=0)) + 1e-12
+    return float(np.sqrt(np.mean(((tau_file - tau_model)[:, _SIDE_JOINTS] / size) ** 2)))

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.model_links import ModelBodies
-from dvrk_drake.export.dvrk_mtm_gravity_compensation import POSES, compensation_loss
-from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import CompensationComparison, JointComparison
+from dvrk_drake.export.dvrk_mtm_gravity_compensation import POSES, CompensationComparison, compensation_loss
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import MTM_JOINTS, GravityCompensationFile
 from dvrk_drake.export.dvrk_psm_gravity_compensation import ARM_JOINTS, NAMES, KinematicCompensation
 from dvrk_drake.export.gravity_compensation_loss import ROUNDING, CompensationLoss
@@ -216,17 +215,18 @@ def compensation_page(comparison: CompensationComparison, *, file_name: str = ""
     """
     file_name = file_name or f"file of {comparison.file.arm_name}"
     model_name = model_name or comparison.model.arm.source
-    joints = comparison.joints
     difference = np.abs(comparison.clipped_torque - comparison.model_torque).max(axis=0)
     j = int(np.argmax(difference))
     faults = comparison.clipped | comparison.runaway | comparison.opposed
     marked = 100 * faults[:, : len(MTM_JOINTS) - 1].any(axis=1).mean()
+    in_sweep, outside = (comparison.rms_difference(x) for x in (comparison.in_sweep, ~comparison.in_sweep))
+    limits = np.array([comparison.file.torque_lower, comparison.file.torque_upper])
     rows, ranges = [], []
-    for joint, largest in zip(joints, difference, strict=True):
-        shares = (f"{100 * x:.0f} %" if x else "" for x in (joint.clipped, joint.runaway, joint.opposed))
-        rows.append((joint.name, f"{largest:.3f}", _number(joint.rms_inside), _number(joint.rms_outside), *shares))
-        bounds = ((joint.model_lower, joint.model_upper), (joint.file_lower, joint.file_upper))
-        ranges.append((joint.name, *(_range(*ends) for ends in (*bounds, (joint.clip_lower, joint.clip_upper)))))
+    for i, name in enumerate(MTM_JOINTS):
+        masks = (comparison.clipped, comparison.runaway, comparison.opposed)
+        shares = (f"{100 * mask[:, i].mean():.0f} %" if mask[:, i].any() else "" for mask in masks)
+        rows.append((name, f"{difference[i]:.3f}", _number(in_sweep[i]), _number(outside[i]), *shares))
+        ranges.append((name, *(_range(x[:, i]) for x in (comparison.model_torque, comparison.file_torque, limits))))
     sweep = "the file does not state it"
     if comparison.file.sweep is not None:
         sweep = f"it contains {100 * comparison.in_sweep.mean():.0f} % of the poses"
@@ -236,15 +236,15 @@ def compensation_page(comparison: CompensationComparison, *, file_name: str = ""
     )
     header = ("", "largest", "RMS, in sweep", "RMS, outside", "at limit", "runaway", "opposed")
     caption = f"Torque of the file minus model [N m], {len(comparison.q)} random static poses"
-    limits = f"Torque ranges [N m] of {file_name}, {model_name}"
+    of_ranges = f"Torque ranges [N m] of {file_name}, {model_name}"
     blocks: list[Block] = [
         *(Text(f"{file_name}: {warning}.", "warning", show="page") for warning in comparison.warnings),
         Table(header, rows, caption, note),
-        Table(("", "model", "file before limits", "limits"), ranges, limits, show="details"),
+        Table(("", "model", "file before limits", "limits"), ranges, of_ranges, show="details"),
     ]
     return Page(
         f"{Path(file_name).name} compared with {model_name}",
-        f"Largest difference between file and model: {difference[j]:.3f} N m ({joints[j].name}). Poses with a torque "
+        f"Largest difference between file and model: {difference[j]:.3f} N m ({MTM_JOINTS[j]}). Poses with a torque "
         f"at limit, runaway or opposed: {marked:.3g} %.",
         [Section("Differences per joint", blocks), Section("Torque over position", [_compensation_plot(comparison)])],
         "warning" if marked else "good",
@@ -255,12 +255,12 @@ def compensation_page(comparison: CompensationComparison, *, file_name: str = ""
 def _compensation_plot(comparison: CompensationComparison) -> Plot:
     """Returns the torques of the file and of the model over the position of each joint."""
     # The file has no torque for the last joint.
-    panels = [_torque_panel(comparison, joint, j) for j, joint in enumerate(comparison.joints[:-1])]
+    panels = [_torque_panel(comparison, name, j) for j, name in enumerate(MTM_JOINTS[:-1])]
     caption = "Static torque: mean (line) and range (band) over the positions of the other joints"
     return Plot("compensation", caption, panels, columns=2)
 
 
-def _torque_panel(comparison: CompensationComparison, joint: JointComparison, j: int) -> Panel:
+def _torque_panel(comparison: CompensationComparison, name: str, j: int) -> Panel:
     q = comparison.q[:, j]
     edges = np.linspace(q.min(), q.max(), _BINS + 1)
     index = np.clip(np.digitize(q, edges) - 1, 0, _BINS - 1)
@@ -274,16 +274,16 @@ def _torque_panel(comparison: CompensationComparison, joint: JointComparison, j:
         (comparison.file_torque, REFERENCE, "file, without torque limits", "line"),
         (comparison.model_torque, FITTED, "model", "dashed"),
     )
-    for torque, colour, name, style in torques:
+    for torque, colour, label, style in torques:
         low, middle, high = (np.array([f(torque[m, j]) for m in members]) for f in (np.min, np.mean, np.max))
-        marks += [Band("", centres, low, high, colour), Curve(name, centres, middle, colour, style)]
-    for limit in (joint.clip_lower, joint.clip_upper):
+        marks += [Band("", centres, low, high, colour), Curve(label, centres, middle, colour, style)]
+    for limit in (comparison.file.torque_lower[j], comparison.file.torque_upper[j]):
         marks.append(Guide("y", limit, None, LIMIT, "torque limits of the file"))
-    return Panel(f"J{j + 1} {joint.name}", marks, f"q{j + 1} [rad]", "torque [N m]", height=210)
+    return Panel(f"J{j + 1} {name}", marks, f"q{j + 1} [rad]", "torque [N m]", height=210)
 
 
-def _range(lower: float, upper: float) -> str:
-    return "..".join(f"{round(x, 3) + 0.0:+.3f}" for x in (lower, upper))
+def _range(values: NDArray[np.float64]) -> str:
+    return "..".join(f"{round(float(x), 3) + 0.0:+.3f}" for x in (values.min(), values.max()))
 
 
 def _number(x: float) -> str:

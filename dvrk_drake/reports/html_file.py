@@ -173,7 +173,7 @@ def write_report(
 
     Example:
         >>> import dvrk_drake as dvrk
-        >>> from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation
+        >>> from dvrk_drake.export.dvrk_mtm_gravity_compensation import compare_compensation
         >>> from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
         >>> model = dvrk.IdentifiedModel.from_arm(dvrk.load_arm("mtml"))
         >>> exported = dvrk.export_model(model, "gc-MTML.json", "dvrk-gc", tolerance=1.0)

@@ -21,8 +21,8 @@ from dvrk_drake.dynamics.inertial_parameters import pseudo_inertia
 from dvrk_drake.errors import ModelError, RecordingError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import DriveEffect
+from dvrk_drake.recordings.formats import write_recording
 from dvrk_drake.recordings.recording import Recording
-from dvrk_drake.recordings.writing import write_recording
 
 pytestmark = pytest.mark.numeric
 

@@ -11,17 +11,15 @@ from io import StringIO
 import numpy as np
 import pytest
 
-from dvrk_drake.analysis.effects_at_rest import with_effects_at_rest
 from dvrk_drake.analysis.motion_validation import validate_motion
 from dvrk_drake.analysis.observations.observations import Observations
-from dvrk_drake.analysis.pose_identification import identify_static
+from dvrk_drake.analysis.pose_identification import identify_static, with_effects_at_rest
 from dvrk_drake.analysis.recalibration import refit_friction
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.formats import read_recording, write_recording
 from dvrk_drake.recordings.recording import Recording
-from dvrk_drake.recordings.writing import write_recording
 
 pytestmark = [pytest.mark.numeric, pytest.mark.slow]
 

@@ -17,9 +17,8 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.kinematics import PRIOR_FORCE, Contact
 from dvrk_drake.errors import ArmError, ModelError
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.formats import read_recording, write_recording
 from dvrk_drake.recordings.recording import Recording
-from dvrk_drake.recordings.writing import write_recording
 from dvrk_drake.reports.external_force import force_page
 
 FORCE = np.array([1.0, -2.0, 3.0])

@@ -11,8 +11,8 @@ from dvrk_drake.analysis.identification import LARGE_TILT, gravity_direction
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
 from dvrk_drake.errors import IdentificationError
+from dvrk_drake.recordings.formats import write_recording
 from dvrk_drake.recordings.recording import Recording
-from dvrk_drake.recordings.writing import write_recording
 from dvrk_drake.reports.answers import answer_of
 
 #: The first three joints of a PSM, because their gravity model is derived quickly.

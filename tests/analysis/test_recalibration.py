@@ -17,8 +17,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import EFFECT_KINDS
-from dvrk_drake.recordings.reading import read_recording
-from dvrk_drake.recordings.writing import write_recording
+from dvrk_drake.recordings.formats import read_recording, write_recording
 
 pytestmark = pytest.mark.slow
 

@@ -9,17 +9,16 @@ from motions import fourier_motion, friction_everywhere, recorded, true_dynamics
 
 import dvrk_drake as dvrk
 from dvrk_drake.analysis import identification
-from dvrk_drake.analysis.effects_at_rest import with_effects_at_rest
 from dvrk_drake.analysis.motion_identification import thinned
 from dvrk_drake.analysis.motion_validation import validate_motion
 from dvrk_drake.analysis.observations.observations import Observations
-from dvrk_drake.analysis.pose_identification import identify_static
+from dvrk_drake.analysis.pose_identification import identify_static, with_effects_at_rest
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
 from dvrk_drake.dynamics.dynamic_regressor import derive_base_parameters
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.effects_schema import DriveEffect
-from dvrk_drake.recordings.writing import write_recording
+from dvrk_drake.recordings.formats import write_recording
 
 pytestmark = pytest.mark.numeric
 

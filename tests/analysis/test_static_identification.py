@@ -19,7 +19,7 @@ from dvrk_drake.errors import IdentificationError, ModelError, RecordingError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.models.sdf_model import MODELS_FOLDER
-from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.formats import read_recording
 from dvrk_drake.recordings.recording import Recording
 
 pytestmark = [pytest.mark.numeric, pytest.mark.slow]

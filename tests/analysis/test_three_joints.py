@@ -16,9 +16,8 @@ from dvrk_drake.export.dvrk_psm_gravity_compensation import kinematic_compensati
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import DriveEffect
 from dvrk_drake.models.locked_joints import lock_joints
-from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.formats import read_recording, write_recording
 from dvrk_drake.recordings.recording import Recording
-from dvrk_drake.recordings.writing import write_recording
 
 pytestmark = [pytest.mark.numeric, pytest.mark.slow]
 

@@ -30,9 +30,8 @@ from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import ArmEffects, DriveEffect
 from dvrk_drake.processes.arm_session import Dialog
 from dvrk_drake.processes.connection import model_warning
-from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.formats import read_recording, write_recording
 from dvrk_drake.recordings.recording import Recording
-from dvrk_drake.recordings.writing import write_recording
 
 ARM = load_arm("mtmr")
 LIMITS = Tolerance(friction=0.4, stiffness=0.6)

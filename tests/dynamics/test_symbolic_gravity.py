@@ -9,9 +9,8 @@ from paper_regressor import paper_regressor
 
 from dvrk_drake.dynamics import gravity_parameters as numeric
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
-from dvrk_drake.dynamics.base_parameters import independent_columns, reduce_to_base
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
-from dvrk_drake.dynamics.gravity_parameters import gravity_parameters
+from dvrk_drake.dynamics.gravity_parameters import gravity_parameters, independent_columns, reduce_to_base
 from dvrk_drake.dynamics.holding_torque import static_model
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.symbolic_gravity import GRAVITY, SymbolicPlant, derive_gravity

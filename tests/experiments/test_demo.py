@@ -17,7 +17,7 @@ from dvrk_drake.experiments.ground_truth import (
     simulate_poses,
 )
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.formats import read_recording
 from dvrk_drake.reports.demo import demo_page, write_demo
 from dvrk_drake.reports.plot import Curve
 from dvrk_drake.systems.arm_station import ArmStation

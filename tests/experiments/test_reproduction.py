@@ -37,7 +37,7 @@ from dvrk_drake.experiments.paper_experiments import (
 from dvrk_drake.experiments.releases import BAND, SAMPLE_PERIOD, Drifts, release, release_all
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_selector
-from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.formats import read_recording
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.reports import reproduction as reproduction_page
 from dvrk_drake.reports import reproduction_drift as drift

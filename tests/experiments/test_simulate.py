@@ -16,7 +16,7 @@ from dvrk_drake.experiments.scenario import load_scenario
 from dvrk_drake.experiments.simulation import advance, simulate
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions
-from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.formats import read_recording
 
 pytestmark = pytest.mark.drake_api
 

@@ -17,9 +17,8 @@ from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.dvrk_tool import dvrk_tools, read_tool
 from dvrk_drake.models.files import read_json_input
 from dvrk_drake.models.plant import dh_frames, holding_torques, make_arm_plant, set_arm_positions, shared_plant
-from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.formats import read_recording, write_recording
 from dvrk_drake.recordings.recording import Recording
-from dvrk_drake.recordings.writing import write_recording
 
 #: Largest rounding error of an angle in the files [rad], e.g. 1.5708 for a quarter turn.
 ROUNDING = 1e-5

@@ -24,8 +24,7 @@ from dvrk_drake.models.sdf_model import compose_sdf
 from dvrk_drake.models.typed_yaml import parse_yaml
 from dvrk_drake.processes.simulated_arm import load_driver
 from dvrk_drake.recordings import csv_files
-from dvrk_drake.recordings.reading import read_recording
-from dvrk_drake.recordings.writing import write_recording
+from dvrk_drake.recordings.formats import read_recording, write_recording
 
 ARM = load_arm("mtml")
 #: Mapping from a file name to its reader.

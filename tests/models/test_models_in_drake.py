@@ -18,13 +18,16 @@ from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ModelError
 from dvrk_drake.experiments.paper import PAPER
-from dvrk_drake.export.dvrk_mtm_gravity_compensation import CompensationOptions, compensation_from_model
-from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation
+from dvrk_drake.export.dvrk_mtm_gravity_compensation import (
+    CompensationOptions,
+    compare_compensation,
+    compensation_from_model,
+)
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile, controller_torque
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.arm_files import known_arms, load_arm
 from dvrk_drake.models.plant import holding_torque, make_arm_plant, package_map, set_arm_positions
-from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.formats import read_recording
 
 pytestmark = pytest.mark.drake_api
 

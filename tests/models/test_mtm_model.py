@@ -6,10 +6,9 @@ from command_output import assert_refused
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.tree import SpatialInertia, UnitInertia
 
-from dvrk_drake.dynamics.kinematics import ArmFrame
+from dvrk_drake.dynamics.kinematics import ArmFrame, inverse_kinematics
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm_files import known_arms, load_arm
-from dvrk_drake.models.inverse_kinematics import inverse_kinematics
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_selector
 
 pytestmark = pytest.mark.drake_api

@@ -18,7 +18,7 @@ from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes.collector import CollectionSettings
 from dvrk_drake.processes.control import AnswerTimes, takeover_reason
 from dvrk_drake.processes.teacher import EnterKey, Teacher
-from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.formats import read_recording
 
 FRICTION = 0.08 * load_arm("mtml").effort_limits
 

@@ -17,7 +17,7 @@ from dvrk_drake.processes.arm_controller import ArmController
 from dvrk_drake.processes.motion_parts import MotionPartFile, begin_of_rest, next_part, recorded_parts, useful
 from dvrk_drake.processes.motion_player import MotionPlayer
 from dvrk_drake.processes.teacher import RestDetector
-from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.formats import read_recording
 from dvrk_drake.systems.cubic_trajectory import CubicTrajectory
 
 ARM = load_arm("mtml")

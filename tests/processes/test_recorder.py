@@ -10,7 +10,7 @@ from status_logs import ARM, statuses
 from dvrk_drake.models.lcm_messages import MessageKey, status_channel
 from dvrk_drake.processes import recorder as module
 from dvrk_drake.processes.recorder import LcmRecorder
-from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.formats import read_recording
 
 KEY = MessageKey(bytes(range(32)))
 

@@ -19,7 +19,7 @@ from dvrk_drake.errors import DvrkDrakeError, RecordingError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.processes import recorder as module
 from dvrk_drake.processes.recorder import RosRecorder, missing_messages
-from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.formats import read_recording
 from dvrk_drake.systems.ros import discovery
 from dvrk_drake.systems.ros.open_domain import domain_number
 

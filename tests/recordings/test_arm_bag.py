@@ -20,10 +20,9 @@ from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.locked_joints import lock_joints
 from dvrk_drake.models.plant import make_arm_plant, set_arm_positions, tree_selector
 from dvrk_drake.models.sdf_model import compose_sdf
-from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.formats import read_recording, write_recording
 from dvrk_drake.recordings.recording import Recording, Setpoints
 from dvrk_drake.recordings.writer_mcap import joint_state_topics
-from dvrk_drake.recordings.writing import write_recording
 
 pytestmark = pytest.mark.drake_api
 

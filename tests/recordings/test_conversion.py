@@ -7,9 +7,8 @@ import pytest
 from public_files import assert_refused, wpi_rows, write_mat, write_wpi
 
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.formats import convert, read_recording, write_recording
 from dvrk_drake.recordings.recording import Recording
-from dvrk_drake.recordings.writing import convert, write_recording
 
 
 def assert_equal(first: Recording, second: Recording) -> None:

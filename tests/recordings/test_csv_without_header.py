@@ -9,7 +9,7 @@ import pytest
 from public_files import NUMBERS, assert_refused, wpi_rows, write_text, write_wpi
 
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.formats import read_recording
 
 ARM = load_arm("mtml")
 

@@ -10,7 +10,7 @@ from collector_files import joint_state, write_collection
 from public_files import assert_refused
 
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.recordings.reading import detect_format, read_recording
+from dvrk_drake.recordings.formats import detect_format, read_recording
 
 JOINTS, ACTUATORS = "StateDataCollection-MTML-StateTable-2025-10-06-13", "StateDataCollection-io-MTMLRead-2025-10-06-13"
 

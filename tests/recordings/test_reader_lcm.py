@@ -17,8 +17,8 @@ from dvrk_drake.errors import RecordingError
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings import writer_mcap
+from dvrk_drake.recordings.formats import read_recording
 from dvrk_drake.recordings.reader_lcm import StatusStream, read_events
-from dvrk_drake.recordings.reading import read_recording
 from dvrk_drake.recordings.writer_stream import check_stream_output, open_recording_file
 
 

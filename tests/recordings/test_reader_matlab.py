@@ -14,7 +14,7 @@ from public_files import assert_refused, team_array, write_mat
 
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.recordings import reader_matlab
-from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.formats import read_recording
 
 
 def blocks(rows=20):

@@ -13,7 +13,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.locked_joints import lock_joints
-from dvrk_drake.recordings.reading import detect_format, read_recording
+from dvrk_drake.recordings.formats import detect_format, read_recording
 
 START = 1_700_000_000_000_000_000
 

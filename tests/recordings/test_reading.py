@@ -9,9 +9,8 @@ from public_files import assert_refused, team_array, wpi_rows, write_mat, write_
 
 from dvrk_drake.analysis.excitation.pose_file import CollectionFile
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.recordings.reading import detect_format, read_recording
+from dvrk_drake.recordings.formats import detect_format, read_recording, write_recording
 from dvrk_drake.recordings.recording import Recording
-from dvrk_drake.recordings.writing import write_recording
 
 ARRAYS, CSV = "a MATLAB file or NumPy archive", "a CSV"
 

@@ -14,8 +14,7 @@ from recordings import random_recording, write_text
 from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.files import atomic_write
-from dvrk_drake.recordings.reading import read_recording
-from dvrk_drake.recordings.writing import write_recording
+from dvrk_drake.recordings.formats import read_recording, write_recording
 
 
 @pytest.mark.parametrize("absent", [(), ("t",), ("qd",), ("tau",), ("t", "qd", "tau")])

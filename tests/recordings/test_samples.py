@@ -13,8 +13,7 @@ from repository import ROOT
 
 import dvrk_drake as dvrk
 from dvrk_drake.cli import main
-from dvrk_drake.recordings.reading import read_recording
-from dvrk_drake.recordings.writing import SAMPLES, SAMPLES_FOLDER
+from dvrk_drake.recordings.formats import SAMPLES, SAMPLES_FOLDER, read_recording
 
 FILES = {f"{name}{suffix}" for name in SAMPLES for suffix in (".csv", ".mcap")}
 #: Largest tracking error of the simulated motions [rad, m]: friction stops the light wrist joints of an MTM.
@@ -109,7 +108,7 @@ def test_failed_write_leaves_no_files(tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("dvrk_drake.recordings.writing.write_recording", full)
+    monkeypatch.setattr("dvrk_drake.recordings.formats.write_recording", full)
     assert_refused(dvrk.DvrkDrakeError, "No space left on device", dvrk.write_samples, tmp_path)
     assert not list(tmp_path.iterdir())
 

@@ -16,10 +16,9 @@ from rosbags.highlevel import AnyReader
 
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.formats import read_recording, write_recording
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.recordings.writer_mcap import CHUNK_TIME, ArmMessages, GrowingMcap
-from dvrk_drake.recordings.writing import write_recording
 
 ARMS = {name: load_arm(name) for name in ("mtml", "psm")}
 TOPICS = {"mtml": ["/MTML/measured_js"], "psm": ["/PSM/jaw/measured_js", "/PSM/measured_js"]}

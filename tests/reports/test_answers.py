@@ -19,7 +19,7 @@ from dvrk_drake.cli.program import app
 from dvrk_drake.dynamics.symbolic_gravity import derive_gravity
 from dvrk_drake.experiments.demo import DemoResult
 from dvrk_drake.experiments.teleoperation import TeleoperationResult
-from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation
+from dvrk_drake.export.dvrk_mtm_gravity_compensation import compare_compensation
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
 from dvrk_drake.reports import demo, export, recording_check, simulation, terminal
 from dvrk_drake.reports.identification import identification_page, recalibration_page

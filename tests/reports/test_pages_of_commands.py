@@ -17,7 +17,7 @@ from report_results import operator_forces, study_results, tuning_result
 import dvrk_drake as dvrk
 from dvrk_drake.cli import main
 from dvrk_drake.errors import DvrkDrakeError
-from dvrk_drake.export.dvrk_mtm_gravity_compensation_comparison import compare_compensation
+from dvrk_drake.export.dvrk_mtm_gravity_compensation import compare_compensation
 from dvrk_drake.export.dvrk_mtm_gravity_compensation_file import GravityCompensationFile
 from dvrk_drake.models.files import Reportable
 from dvrk_drake.reports.excitation import motion_page, poses_page

@@ -15,7 +15,7 @@ from dvrk_drake.analysis.excitation.pose_file import load_poses, save_poses
 from dvrk_drake.cli import main
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.formats import read_recording
 
 pytestmark = [pytest.mark.network, pytest.mark.realtime, pytest.mark.slow]
 

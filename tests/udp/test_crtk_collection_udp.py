@@ -19,7 +19,7 @@ from waiting import TIMEOUT, wait_until
 from dvrk_drake.analysis.excitation.pose_file import save_poses
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.formats import read_recording
 
 ros = pytest.importorskip("dvrk_drake.systems.ros.domain", reason="needs cyclonedds")
 from dvrk_drake.systems.ros.messages import Empty, JointState, OperatingState  # noqa: E402

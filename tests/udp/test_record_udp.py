@@ -18,8 +18,8 @@ from status_logs import ARM, log_bytes, statuses
 from waiting import wait_until
 
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
+from dvrk_drake.recordings.formats import read_recording
 from dvrk_drake.recordings.reader_lcm import measurements, read_events
-from dvrk_drake.recordings.reading import read_recording
 
 TOOLS = Path(lcm.__file__).parents[1] / "bin"  # the programs themselves: those on the PATH start them as children
 pytestmark = [

@@ -18,9 +18,9 @@ from dvrk_drake.dynamics.actuator_effects import (
     position_along,
     spring_over,
 )
-from dvrk_drake.dynamics.base_parameters import independent_columns
 from dvrk_drake.dynamics.dynamic_model import ROUNDING_EFFORT, effect_shapes, is_loaded
 from dvrk_drake.dynamics.dynamic_regressor import DynamicRegressor
+from dvrk_drake.dynamics.gravity_parameters import independent_columns
 from dvrk_drake.errors import ArmError
 from dvrk_drake.models.arm import Arm
 

@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
 from pydrake.solvers import MathematicalProgram, SnoptSolver, SolverOptions
 
-from dvrk_drake.analysis.excitation.information import STEP, MotionInformation
-from dvrk_drake.analysis.excitation.motion_limits import ROUNDING, MotionLimits, first_collision, motion_violations
-from dvrk_drake.analysis.excitation.periodic_motion import FourierBasis, PeriodicMotion
-from dvrk_drake.analysis.excitation.random_motion import (
+from dvrk_drake.analysis.excitation.information import (
+    STEP,
     USED,
+    MotionInformation,
     effort_without_friction,
     middle_pose,
     random_motion,
@@ -22,6 +21,8 @@ from dvrk_drake.analysis.excitation.random_motion import (
     state_of,
     states_at,
 )
+from dvrk_drake.analysis.excitation.motion_limits import ROUNDING, MotionLimits, first_collision, motion_violations
+from dvrk_drake.analysis.excitation.periodic_motion import FourierBasis, PeriodicMotion
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import ExcitationError
 from dvrk_drake.models.arm import Arm

@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dvrk_drake.analysis.estimation.pose_effects import MIN_TORQUE, StaticProblem, candidate_effects
-from dvrk_drake.analysis.excitation.information import ExpectedError
+from dvrk_drake.analysis.excitation.information import ExpectedError, middle_pose
 from dvrk_drake.analysis.excitation.motion_limits import PATH_STEP, ROUNDING, CollisionDetector, MotionLimits
 from dvrk_drake.analysis.excitation.pose_file import approach_offset, offset_pose, save_poses
 from dvrk_drake.analysis.excitation.predicted_effort import PredictedEffort
-from dvrk_drake.analysis.excitation.random_motion import middle_pose
 from dvrk_drake.analysis.observations.static_poses import MIN_POSES
 from dvrk_drake.dynamics.actuator_effects import ActuatorEffect
 from dvrk_drake.errors import ExcitationError

@@ -17,9 +17,8 @@ from dvrk_drake.cli import main
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.plant import holding_torques
-from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.formats import read_recording, write_recording
 from dvrk_drake.recordings.recording import MIN_ROWS, Recording
-from dvrk_drake.recordings.writing import write_recording
 
 pytestmark = pytest.mark.slow
 

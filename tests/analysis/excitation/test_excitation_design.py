@@ -11,11 +11,10 @@ from recordings import csv_block
 
 import dvrk_drake as dvrk
 from dvrk_drake.analysis.excitation.design import contracted
-from dvrk_drake.analysis.excitation.information import MotionInformation
+from dvrk_drake.analysis.excitation.information import MotionInformation, random_motion, state_of
 from dvrk_drake.analysis.excitation.motion_limits import MotionLimits, motion_violations
 from dvrk_drake.analysis.excitation.periodic_motion import PeriodicMotion
 from dvrk_drake.analysis.excitation.predicted_effort import PredictedEffort
-from dvrk_drake.analysis.excitation.random_motion import random_motion, state_of
 from dvrk_drake.analysis.motion_identification import identify_dynamic
 from dvrk_drake.analysis.observations.observations import Observations
 from dvrk_drake.cli import main

@@ -13,7 +13,7 @@ from dvrk_drake.analysis.excitation.pose_file import CollectionFile, load_poses,
 from dvrk_drake.cli import main
 from dvrk_drake.errors import CollectionError, RecordingError
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.formats import read_recording
 
 ARMS = ("mtml", "psm")
 

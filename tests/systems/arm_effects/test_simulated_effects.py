@@ -16,7 +16,7 @@ from dvrk_drake.experiments.simulation import simulate
 from dvrk_drake.models.arm_files import known_arms, load_arm
 from dvrk_drake.models.effects_schema import EFFECT_NAMES, ArmEffects, FrictionEffect
 from dvrk_drake.models.sdf_model import MODELS_FOLDER
-from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.formats import read_recording
 from dvrk_drake.systems.arm_station import ArmStation
 
 pytestmark = [pytest.mark.numeric, pytest.mark.drake_api]

@@ -9,7 +9,7 @@ from dvrk_drake.dynamics.identified_model import ControlModel, IdentifiedModel
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
 from dvrk_drake.lcmtypes import lcmt_dvrk_status as Status
 from dvrk_drake.models.arm_files import load_arm
-from dvrk_drake.recordings.reading import read_recording
+from dvrk_drake.recordings.formats import read_recording
 from dvrk_drake.systems.guard.limits import GuardLimits
 from dvrk_drake.systems.guard.plausibility import Plausibility
 from dvrk_drake.systems.guard.settings import GuardSettings, PlausibilitySettings
