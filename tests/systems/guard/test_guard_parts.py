@@ -130,13 +130,6 @@ def test_repeated_and_older_measurements():
     assert measured.store(NOW - 1000 * MS, GOOD, GOOD, GOOD) == "" and measured.dt == np.inf
 
 
-def test_measurement_is_copied():
-    measured, q = measurement(), GOOD.copy()
-    measured.store(NOW, q, q, q)
-    q[:] = 9.0
-    np.testing.assert_array_equal(measured.q, GOOD)
-
-
 @pytest.mark.parametrize(("number", "finite"), [(0.99e6, True), (1e6, False), (-1e6, False), (np.nan, False)])
 def test_is_finite_bounds_the_sum_to_a_million(number, finite):
     assert is_finite([0.0, number, 1.0]) == is_finite([number, 0.0]) == finite
@@ -206,20 +199,6 @@ def test_sender_clock_must_advance_with_arm_clock(ahead, jumps):
         assert stream.send(41 * MS) is False
 
 
-@pytest.mark.parametrize("jump", [{"ahead": 10**9}, {"ahead": -(10**9)}, {"step": 2**62}, {"step": -(2**62)}])
-def test_sender_restarts_after_jump_and_expiry(jump):
-    stream, (name, size) = Stream(), next(iter(jump.items()))
-    stream.send(0)
-    first = stream.send(MS, **jump)
-    assert first in (Status.REFUSAL_CLOCK_JUMP, Status.REFUSAL_SEQUENCE_JUMP, Status.REFUSAL_OUT_OF_ORDER)
-    changes = {"ahead": size} if name == "ahead" else {}
-    for k in range(2, 51):
-        assert stream.send(k * MS, **changes) == first
-    assert stream.send(50 * MS + 1, **changes) is False
-    assert stream.stream.lost == 0
-    assert stream.send(51 * MS + 1, **changes) is False
-
-
 def test_stopped_sender_clock_is_a_jump():
     stream = Stream()
     stream.send(0)
@@ -236,28 +215,6 @@ def test_missing_commands_are_counted():
     assert stream.stream.lost == 2 + 1
     stream.send(10 * MS, step=1 - 2**62 + 999)
     assert stream.stream.lost == 2 + 1 + 999
-
-
-def test_reset_is_a_change_from_false_to_true():
-    stream = Stream()
-    requested = [
-        stream.send(k * MS, reset=reset) for k, reset in enumerate([True, True, False, True, True, False, True])
-    ]
-    assert requested == [False, False, False, True, False, False, True]
-    # The flag of another sender does not count.
-    stream.send(8 * MS)
-    assert stream.send(60 * MS, sender=6, reset=True) is False
-
-
-def test_forget_discards_the_sender():
-    stream = Stream()
-    stream.send(50 * MS)
-    stream.stream.forget()
-    assert stream.stream.sender_id == 0
-    # After a backward clock, an older time, a lower sequence and another sender are accepted.
-    assert stream.send(0, Command.OFF, sender=6, step=-5) == Status.REFUSAL_SUDDEN_OFF
-    assert stream.send(MS, reset=True, sender=6) is False
-    assert stream.stream.lost == 0
 
 
 # Settings
