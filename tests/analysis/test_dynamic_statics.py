@@ -10,13 +10,11 @@ from dvrk_drake.analysis.estimation.motion_estimates import base_parameter_estim
 from dvrk_drake.dynamics.actuator_effects import (
     ActuatorEffect,
     distinct_coordinates,
-    effect_column,
     effect_fault,
     is_prismatic,
     joint_row,
 )
 from dvrk_drake.dynamics.dynamic_model import DynamicModel
-from dvrk_drake.dynamics.holding_torque import holding_torque_into, static_model
 from dvrk_drake.dynamics.identified_model import IdentifiedModel, JointStatistics
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm_files import load_arm
@@ -103,25 +101,6 @@ def test_loaded_model_is_equal_and_conflicts_are_rejected(case, tmp_path):
     with pytest.raises(ModelError, match=r"gravity must equal dynamics\.gravity"):
         dynamics = dataclasses.replace(model.dynamics, gravity=[float(-g) for g in model.arm.gravity])
         dataclasses.replace(model, dynamics=dynamics).check()
-
-
-def test_poses_and_motions_use_the_same_columns(case):
-    arm = case[0]
-    effects = all_effects(arm)
-    q = arm.sample_poses(50, np.random.default_rng(2))
-    model = static_model(arm, effects)
-    for effect, theta in zip(
-        effects, np.eye(len(model.gravity.base.names) + len(effects))[-len(effects) :], strict=True
-    ):
-        column = np.empty(q.shape)
-        for pose, out in zip(q, column, strict=True):
-            holding_torque_into(pose, model.with_parameters(theta), out)
-        np.testing.assert_allclose(model.torque(q, theta), column, atol=1e-12, err_msg=str(effect))
-        np.testing.assert_allclose(column, effect_column(arm, effect, q), atol=1e-12, err_msg=str(effect))
-        a = arm.transmission.position(q)
-        x = a @ arm.effect_coordinates[effect.coordinate]
-        in_motion = effect.column(x, 0 * x)[:, None] * arm.effect_coordinates[effect.coordinate]
-        np.testing.assert_allclose(column, arm.transmission.pull_back_effort(in_motion), atol=1e-12)
 
 
 def test_effects_are_bounded_outside_the_recorded_range():
