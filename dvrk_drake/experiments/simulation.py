@@ -181,7 +181,10 @@ def _simulate(
     trajectory = _trajectory(times, poses, scenario.duration)
     desired = TrajectorySource(trajectory, output_derivative_order=1) if holds else None
     builder = DiagramBuilder()
-    friction = _friction(scenario)
+    settings = scenario.controller
+    friction = friction_compensator(
+        arm, scenario.model, settings.friction_ratio, settings.hysteresis_ratio, period=scenario.time_step
+    )
     add_closed_loop(builder, station, controller, desired, friction)
     hand = _add_hand(builder, station, scenario)
     outputs = [station.GetOutputPort(f"{name}.{port}") for port in ("state_estimated", "effort_measured", "state_true")]
@@ -303,25 +306,36 @@ def phases(scenario: Scenario) -> Callable[[float], str]:
     return phase
 
 
-def simulated_holding_error(model: IdentifiedModel) -> NDArray[np.float64]:
-    """Returns the assumed error (n,) of the model's gravity torque, which is zero for a nominal model.
+def friction_compensator(
+    arm: Arm,
+    model: IdentifiedModel,
+    ratio: float,
+    hysteresis_ratio: float = 0.0,
+    *,
+    friction: Friction | None = None,
+    period: float = 1e-3,
+) -> FrictionCompensator | None:
+    """Returns a compensator for a simulated arm, or None if no friction is compensated.
+
+    Args:
+        arm: Simulated arm.
+        model: Model of the controller. The gravity torque of a nominal model is assumed to have no error.
+        ratio, hysteresis_ratio: Compensated shares, see `FrictionCompensator`.
+        friction: Friction model. None: that of `arm`.
+        period: Period of the controller [s].
 
     Raises:
         ControllerError: See `holding_error`.
     """
-    return np.zeros(model.arm.num_joints) if model.provenance.method == "nominal" else holding_error(model)
-
-
-def _friction(scenario: Scenario) -> FrictionCompensator | None:
-    controller = scenario.controller
-    if not (controller.friction_ratio or controller.hysteresis_ratio):
+    if not (ratio or hysteresis_ratio):
         return None
+    nominal = model.provenance.method == "nominal"
     return FrictionCompensator(
-        Friction.of_arm(scenario.mounted_arm),
-        ratio=controller.friction_ratio,
-        hysteresis_ratio=controller.hysteresis_ratio,
-        holding_error=simulated_holding_error(scenario.model),
-        period=scenario.time_step,
+        friction or Friction.of_arm(arm),
+        ratio=ratio,
+        hysteresis_ratio=hysteresis_ratio,
+        holding_error=np.zeros(arm.num_joints) if nominal else holding_error(model),
+        period=period,
     )
 
 

@@ -21,7 +21,7 @@ from dvrk_drake.dynamics.kinematics import Contact
 from dvrk_drake.experiments.simulation import recorded_in
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.systems.arm_view.efforts import DrawnForce
-from dvrk_drake.systems.arm_view.overlay import ArmOverlay, PanelText
+from dvrk_drake.systems.arm_view.overlay import ArmOverlay
 from dvrk_drake.systems.arm_view.page import add_ground, geometry_corners, start_meshcat
 from dvrk_drake.systems.hand import PoseTrajectorySource
 from dvrk_drake.systems.teleoperated_arms import TeleoperatedArms, Wall
@@ -307,7 +307,7 @@ class TeleoperationScene:
     def __init__(self, arms: TeleoperatedArms, meshcat: Meshcat) -> None:
         """Adds the overlays. The ghost of the PSM shows its desired pose."""
         self._overlays = {station: ArmOverlay(station.arm, meshcat) for station in (arms.master, arms.follower)}
-        self._state = PanelText(meshcat)
+        self._follower = arms.follower
         self._next_text = 0.0
 
     def draw(self, arms: TeleoperatedArms, context: Context, time: float | None = None) -> None:
@@ -337,7 +337,7 @@ class TeleoperationScene:
             return
         self._next_text = now + 0.5
         error = "" if tracking is None else f", error {1e3 * tracking:.1f} mm"
-        self._state.show(("clutch closed" if follows else "clutch open") + error)
+        self._overlays[self._follower].set_state(("clutch closed" if follows else "clutch open") + error)
 
 
 def start_scene(port: int | None = None) -> Meshcat:

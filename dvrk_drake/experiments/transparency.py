@@ -17,13 +17,12 @@ from dvrk_drake.dynamics.friction_compensation import Friction, check_ratios
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.dynamics.kinematics import ArmFrame
 from dvrk_drake.errors import ModelError, ScenarioError
-from dvrk_drake.experiments.simulation import advance, samples, simulated_holding_error
+from dvrk_drake.experiments.simulation import advance, friction_compensator, samples
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.models.effects_schema import ArmEffects
 from dvrk_drake.recordings.recording import Recording
 from dvrk_drake.systems.arm_station import ArmStation
 from dvrk_drake.systems.closed_loop import add_closed_loop
-from dvrk_drake.systems.friction_compensator import FrictionCompensator
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController, Mode
 from dvrk_drake.systems.hand import Grip, Hand, PoseTrajectorySource
 
@@ -56,7 +55,7 @@ class Compensation:
 
 @dataclass(frozen=True, eq=False)
 class OperatorForces:
-    """Interaction force and torque between the hand of an operator and the handle along a path.
+    """Interaction force and torque between the hand of an operator and the handle along a path, from `GRASP_TIME` on.
 
     Attributes:
         name: Name of the compensation.
@@ -72,21 +71,19 @@ class OperatorForces:
     deviation: NDArray[np.float64]
 
     @property
-    def rms_force(self) -> float:
-        """RMS force after the initial transient of the grasp [N]."""
-        return _rms(self.force[self.time >= GRASP_TIME])
+    def measures(self) -> dict[str, float]:
+        """RMS and 95th percentile of force [N] and torque [N m], and largest deviation [m], by name."""
+        found = {}
+        for name, vectors in (("force", self.force), ("torque", self.torque)):
+            sizes = np.linalg.norm(vectors, axis=1)
+            found[f"rms_{name}"] = float(np.sqrt(np.mean(sizes**2)))
+            found[f"{name}_95"] = float(np.percentile(sizes, 95))
+        return {**found, "largest_deviation": float(self.deviation.max())}
 
     @property
-    def rms_torque(self) -> float:
-        """RMS torque after the initial transient of the grasp [N m]."""
-        return _rms(self.torque[self.time >= GRASP_TIME])
-
-    def peak(self) -> tuple[float, float]:
-        """Returns the 95th percentiles of force [N] and torque [N m] after the initial transient of the grasp."""
-        evaluated = self.time >= GRASP_TIME
-        norms = (np.linalg.norm(x[evaluated], axis=1) for x in (self.force, self.torque))
-        force, torque = (float(np.percentile(norm, 95)) for norm in norms)
-        return force, torque
+    def rms_force(self) -> float:
+        """RMS force [N]."""
+        return self.measures["rms_force"]
 
 
 def random_path(arm: Arm, poses: int = 6, seconds_each: float = 2.5, seed: int = 0) -> PiecewisePolynomial:
@@ -167,7 +164,10 @@ def simulate_operator(
     station = builder.AddSystem(ArmStation(arm, effects=effects, seed=seed))
     if compensation.model is not None:
         controller = GravityPidController(compensation.model, mode=compensation.mode)
-        add_closed_loop(builder, station, controller, friction=_friction(arm, compensation))
+        friction = friction_compensator(
+            arm, compensation.model, compensation.friction_ratio, friction=compensation.friction
+        )
+        add_closed_loop(builder, station, controller, friction=friction)
     hand = builder.AddSystem(Hand(arm, frame_name, grip))
     handle_path = PiecewisePose.MakeLinear(knots, poses)
     source = builder.AddSystem(PoseTrajectorySource(handle_path))
@@ -185,20 +185,8 @@ def simulate_operator(
     positions = np.array([frame.pose(q).translation() for q in state[:, : arm.num_joints]])
     desired = np.array([handle_path.GetPose(min(t, handle_path.end_time())).translation() for t in times])
     deviation = np.linalg.norm(desired - positions, axis=1)
-    return OperatorForces(compensation.name, times, forces[:, :3], forces[:, 3:], deviation)
-
-
-def _friction(arm: Arm, compensation: Compensation) -> FrictionCompensator | None:
-    if not compensation.friction_ratio or compensation.model is None:
-        return None
-    friction = compensation.friction or Friction.of_arm(arm)
-    return FrictionCompensator(
-        friction, ratio=compensation.friction_ratio, holding_error=simulated_holding_error(compensation.model)
-    )
-
-
-def _rms(vectors: NDArray[np.float64]) -> float:
-    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
+    late = times >= GRASP_TIME
+    return OperatorForces(compensation.name, times[late], forces[late, :3], forces[late, 3:], deviation[late])
 
 
 def listed_compensations(arm: Arm, paths: Sequence[str], friction_ratio: float) -> list[Compensation]:

@@ -45,7 +45,7 @@ def forces_table(arm: Arm, forces: Sequence[OperatorForces]) -> Table:
     scales, formats = (1, 1, 1e3, 1e3, 1e3), (".2f", ".2f", ".0f", ".0f", ".1f")
     rows = []
     for one in forces:
-        values = zip(_numbers(one).values(), scales, formats, strict=True)
+        values = zip(one.measures.values(), scales, formats, strict=True)
         rows.append((_name(one, forces), *(f"{scale * value:{form}}" for value, scale, form in values)))
     return Table(
         (
@@ -68,9 +68,8 @@ def forces_plot(forces: Sequence[OperatorForces]) -> Plot:
     for quantity, unit, scale in quantities:
         curves = []
         for i, one in enumerate(forces):
-            late = one.time >= GRASP_TIME
-            size = scale * np.linalg.norm(getattr(one, quantity)[late], axis=1)
-            curves.append(Curve(_name(one, forces), one.time[late], size, **series(i)))
+            size = scale * np.linalg.norm(getattr(one, quantity), axis=1)
+            curves.append(Curve(_name(one, forces), one.time, size, **series(i)))
         panels.append(Panel("", curves, "time [s]", f"{quantity} [{unit}]", height=220))
     caption = f"Magnitude of interaction force and torque at the handle, from {GRASP_TIME:g} s on"
     return Plot("transparency", caption, panels, shared_x=True)
@@ -80,21 +79,9 @@ def write_transparency(path: Path, forces: Sequence[OperatorForces]) -> None:
     """Writes a CSV file with the values of the page in SI units. Replaces the file atomically."""
     with atomic_write(path) as stream:
         rows = csv.writer(stream, lineterminator="\n")
-        rows.writerow(["compensation", *_numbers(forces[0])])
-        rows.writerows([one.name, *(f"{value:.6g}" for value in _numbers(one).values())] for one in forces)
+        rows.writerow(["compensation", *forces[0].measures])
+        rows.writerows([one.name, *(f"{value:.6g}" for value in one.measures.values())] for one in forces)
 
 
 def _name(one: OperatorForces, forces: Sequence[OperatorForces]) -> str:
     return "none" if one is forces[0] else one.name
-
-
-def _numbers(forces: OperatorForces) -> dict[str, float]:
-    peak_force, peak_torque = forces.peak()
-    late = forces.time >= GRASP_TIME
-    return {
-        "rms_force": forces.rms_force,
-        "force_95": peak_force,
-        "rms_torque": forces.rms_torque,
-        "torque_95": peak_torque,
-        "largest_deviation": float(forces.deviation[late].max()),
-    }

@@ -25,7 +25,7 @@ def constant_pose(seconds):
 
 def test_no_hand_force_on_compensated_arm():
     forces = simulate_operator(ARM, constant_pose(1.5), Compensation("gravity", MODEL))
-    assert forces.rms_force < 1e-6 and forces.rms_torque < 1e-6
+    assert forces.rms_force < 1e-6 and forces.measures["rms_torque"] < 1e-6
     assert forces.deviation.max() < 1e-6
 
 
@@ -48,7 +48,7 @@ def test_each_compensation_reduces_operator_force():
     unpowered, gravity, both = (simulate_operator(ARM, path, one, effects=friction) for one in listed)
     assert unpowered.rms_force > 2 * gravity.rms_force
     assert gravity.rms_force > 1.3 * both.rms_force
-    assert gravity.rms_torque > both.rms_torque
+    assert gravity.measures["rms_torque"] > both.measures["rms_torque"]
 
 
 def test_recorded_path_respects_limits_and_speed():
