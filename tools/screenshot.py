@@ -1,61 +1,48 @@
-"""Writes a picture of an arm in Meshcat. Requires Chromium, but no display.
+"""Writes a picture of an arm in Meshcat, or of a page that was written. Requires Playwright and Chromium.
 
-The pictures of the arms in docs/images:
+The pictures in docs/images:
 
     python tools/screenshot.py docs/images/mtm.png --arm mtml --size 900 800 --pose 0 0.1 0 0.3 0.3 0.4 0 --zoom 3.6 \\
         --target 0 -0.14 0 --camera 1.6 0.75 0.45
     python tools/screenshot.py docs/images/psm.png --arm psm --size 900 700 --pose 0.2 -0.2 0.12 0.3 0.4 0.3 0.4 \\
         --zoom 4 --target 0 -0.27 0.16
-    dvrk-drake teleop --output teleoperation.html
+    dvrk-drake simulate teleop --output teleoperation.html
     python tools/screenshot.py docs/images/teleoperation.png --page teleoperation.html --size 1200 750
+    dvrk-drake samples samples
+    dvrk-drake identify samples/psm_motion.csv --arm psm --output model.yaml --report report.html
+    python tools/screenshot.py docs/images/report.png --page report.html --anchor section-2 --size 1280 1000
 """
 
 import shutil
-import subprocess
 import tempfile
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
+from playwright.sync_api import sync_playwright
 from pydrake.geometry import Meshcat, Role
 
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.systems.arm_view.arm_view import ArmView
-from dvrk_drake.systems.arm_view.page import ZOOM, framing, start_meshcat
+from dvrk_drake.systems.arm_view.page import ZOOM, framing, geometry_corners, start_meshcat
 
-CHROMIUM_FLAGS = (
-    "--headless",
-    "--no-sandbox",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--hide-scrollbars",
-    "--virtual-time-budget=8000",
-)
+FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-gpu")
+#: Time after loading in which meshes appear and plots are drawn [ms].
+SETTLE = 8000
 # Meshcat's page has a control panel that no option hides.
-HIDE_PANEL = "<style>.dg, #status-message, #stats-plot { display: none !important; }</style>"
+HIDE_PANEL = ".dg, #status-message, #stats-plot { display: none !important; }"
 
 
-def write_picture(html: str, file: Path, width: int, height: int, chromium: str) -> None:
-    """Draws the page `html` from `Meshcat.StaticHtml` with Chromium; writes the picture to `file`."""
-    with tempfile.TemporaryDirectory() as folder:
-        page = Path(folder) / "scene.html"
-        page.write_text(html.replace("</head>", HIDE_PANEL + "</head>", 1))
-        command = [
-            chromium,
-            *CHROMIUM_FLAGS,
-            f"--user-data-dir={folder}/profile",
-            f"--window-size={width},{height}",
-            f"--screenshot={file.resolve()}",
-            page.as_uri(),
-        ]
-        file.unlink(missing_ok=True)
-        subprocess.run(command, check=True, capture_output=True, timeout=120)
-    if not file.exists():
-        raise RuntimeError(f"{chromium} did not write {file}.")
+def write_picture(url: str, file: Path, width: int, height: int, chromium: str) -> None:
+    """Draws the page at `url` with Chromium, and writes the picture to `file`."""
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium, args=list(FLAGS))
+        page = browser.new_page(viewport={"width": width, "height": height})
+        page.goto(url)
+        for frame in page.frames:
+            frame.add_style_tag(content=HIDE_PANEL)
+        page.wait_for_timeout(SETTLE)
+        page.screenshot(path=file)
+        browser.close()
 
 
 def main() -> None:
@@ -63,6 +50,7 @@ def main() -> None:
     parser = ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("file", type=Path, help="PNG to write")
     parser.add_argument("--page", type=Path, help="page written by Meshcat, instead of an arm")
+    parser.add_argument("--anchor", default="", help="part of the page that is at the top of the picture")
     parser.add_argument("--arm", default="mtml", help="name of the arm; default: mtml")
     parser.add_argument(
         "--pose",
@@ -95,15 +83,18 @@ def main() -> None:
     )
     parser.add_argument("--chromium", default=shutil.which("chromium") or "chromium", help="program of the browser")
     options = parser.parse_args()
-    html = options.page.read_text() if options.page else scene(options).StaticHtml()
-    write_picture(html, options.file, *options.size, options.chromium)
+    with tempfile.TemporaryDirectory() as folder:
+        page = options.page or Path(folder) / "scene.html"
+        if not options.page:
+            page.write_text(scene(options).StaticHtml())
+        write_picture(f"{page.resolve().as_uri()}#{options.anchor}", options.file, *options.size, options.chromium)
 
 
 def scene(options: Namespace) -> Meshcat:
     """Returns a Meshcat that shows the arm in the given pose."""
     role = Role.kProximity if options.collision else Role.kIllustration
     arm = load_arm(options.arm)
-    camera, target = framing(arm)
+    camera, target = framing(geometry_corners(arm))
     meshcat = start_meshcat(camera=options.camera or camera, target=options.target or target, zoom=options.zoom)
     ArmView(arm, meshcat, role).show(options.pose)
     return meshcat
