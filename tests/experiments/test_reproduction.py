@@ -11,10 +11,9 @@ from command_output import refused
 from figure_rules import checked_figures
 from paper_regressor import paper_regressor
 
-from dvrk_drake.cli import main
 from dvrk_drake.cli.simulate import reproduce as command
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
-from dvrk_drake.errors import DvrkDrakeError, RecordingError
+from dvrk_drake.errors import DvrkDrakeError
 from dvrk_drake.experiments.ground_truth import perturbed_arm
 from dvrk_drake.experiments.paper import (
     PAPER,
@@ -118,20 +117,15 @@ def no_recordings(monkeypatch):
     monkeypatch.delenv("DVRK_DRAKE_SHARED", raising=False)
 
 
-def test_figure_4_without_recording_gives_one_line_error(no_recordings, tmp_path, capsys):
-    output = tmp_path / "out"
-    error = refused(capsys, "reproduce", "fig4", "--folder", output)
-    assert "mtm_2015_good72.csv" in error
-    assert "--data" in error
-    assert not output.exists()
-
-
-def test_rejects_folder_without_recording(no_recordings, tmp_path, capsys):
-    assert main(["reproduce", "all", "--data", str(tmp_path), "--folder", str(tmp_path / "out")]) == 2
-    assert str(tmp_path) in capsys.readouterr().err
-    assert PaperRecordings.find(None).folder is None
-    with pytest.raises(RecordingError, match="mtm_2015_good72"):
-        _ = PaperRecordings.find(None).poses
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [(["fig4"], "mtm_2015_good72.csv"), (["fig4"], "--data"), (["all", "--data", "empty"], "empty")],
+)
+def test_missing_recordings_give_one_line_error(arguments, message, no_recordings, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    assert message in refused(capsys, "reproduce", *arguments, "--folder", "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_finds_recordings_by_environment_variable(monkeypatch, shared_data):

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from figure_rules import checked_figures
 from report_pages import printed
-from scipy.stats import norm
 
 import dvrk_drake.experiments.study_run as study_module
 from dvrk_drake.errors import SimulationError, StudyError
@@ -226,11 +225,6 @@ def test_interrupted_study_keeps_rows_and_cancels_rest(reference, tmp_path):
     with ThreadPoolExecutor(1) as executor:
         run_study(make_study(), executor, path)
     assert path.read_bytes() == reference
-
-
-def test_wilson_bounds_are_1_96_standard_errors_away():
-    for p in wilson_interval(30, 120):
-        assert abs(30 / 120 - p) == pytest.approx(norm.ppf(0.975) * math.sqrt(p * (1 - p) / 120))
 
 
 def test_page_counts_failed_runs_as_worst(tmp_path):
