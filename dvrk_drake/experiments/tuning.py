@@ -45,25 +45,6 @@ POSES, SEED = 6, 3
 
 
 @dataclass(frozen=True, eq=False)
-class StepMeasures:
-    """Performance measures of the n joints in one step, computed from their true positions.
-
-    Attributes:
-        settling: Times (n,) after which the joints stay inside the settling band [s]; infinite for a joint that is
-            outside the band during the last `REST_TIME`.
-        overshoot: Maximum distances (n,) beyond the goal, as shares of the step; 0 for a joint that does not reach the
-            goal.
-        steady_error: Mean distances (n,) from the goal over the last `REST_TIME` [rad, m].
-        oscillation: Peak-to-peak commanded efforts (n,) over the last `REST_TIME`, as shares of the effort limits.
-    """
-
-    settling: NDArray[np.float64]
-    overshoot: NDArray[np.float64]
-    steady_error: NDArray[np.float64]
-    oscillation: NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
 class Comparison:
     """Comparison of several sets of gains for one arm.
 
@@ -72,7 +53,7 @@ class Comparison:
         gains: Gains by name.
         conditions: Conditions (c,) of the arm.
         poses: Start poses (p, n) of the steps.
-        measures: Performance measures [condition][pose], by name of the gains.
+        settling: Settling times (c, p, n) of the joints [s], by name of the gains, see `settling_times`.
         responses: Step responses from the first pose in the first condition, by name of the gains.
     """
 
@@ -80,12 +61,8 @@ class Comparison:
     gains: Mapping[str, Gains]
     conditions: tuple[Condition, ...]
     poses: NDArray[np.float64]
-    measures: Mapping[str, list[list[StepMeasures]]]
+    settling: Mapping[str, NDArray[np.float64]]
     responses: Mapping[str, Response]
-
-    def table(self, name: str, measure: str) -> NDArray[np.float64]:
-        """Returns the field `measure` of `StepMeasures` for the gains with this name, as an array (c, p, n)."""
-        return np.array([[getattr(m, measure) for m in poses] for poses in self.measures[name]])
 
     def best(self, names: Iterable[str]) -> str:
         """Returns the name of the gains for which the fewest joints do not settle.
@@ -94,7 +71,7 @@ class Comparison:
         """
 
         def rank(name: str) -> tuple[int, float]:
-            settling = self.table(name, "settling")
+            settling = self.settling[name]
             failed = ~np.isfinite(settling)
             return int(failed.sum()), float(np.where(failed, DURATION, settling).mean())
 
@@ -108,20 +85,16 @@ def step_goal(arm: Arm, q: NDArray[np.float64]) -> NDArray[np.float64]:
     return goal
 
 
-def measure_step(arm: Arm, response: Response) -> StepMeasures:
-    """Computes the performance measures of a step response."""
-    t, error = response.t, response.q - response.q_desired
-    step = error[0]
-    outside = np.abs(error) > band(arm)
+def settling_times(arm: Arm, response: Response) -> NDArray[np.float64]:
+    """Returns the times (n,) after which the joints stay inside the settling band of their true positions [s].
+
+    The time is infinite for a joint that is outside the band during the last `REST_TIME`.
+    """
+    t = response.t
+    outside = np.abs(response.q - response.q_desired) > band(arm)
     last_outside = np.where(outside.any(axis=0), len(t) - 1 - np.argmax(outside[::-1], axis=0), -1)
     settling = np.append(t, np.inf)[last_outside + 1]
-    at_rest = t > t[-1] - REST_TIME
-    return StepMeasures(
-        settling=np.where(settling > t[-1] - REST_TIME, np.inf, settling),
-        overshoot=np.maximum(np.max(-error / step, axis=0), 0.0),
-        steady_error=np.abs(error[at_rest]).mean(axis=0),
-        oscillation=np.ptp(response.effort[at_rest], axis=0) / arm.effort_limits,
-    )
+    return np.where(settling > t[-1] - REST_TIME, np.inf, settling)
 
 
 def run_step(bench: Bench, q: NDArray[np.float64], gains: Gains) -> Response:
@@ -216,16 +189,18 @@ def _compare(
     }
     await_results(list(runs.values()), progress)
     columns = range(len(conditions))
-    measures = {which: [[runs[which, c, p].result()[0] for p in range(poses)] for c in columns] for which in gains}
+    settling = {
+        which: np.array([[runs[which, c, p].result()[0] for p in range(poses)] for c in columns]) for which in gains
+    }
     responses = {which: runs[which, 0, 0].result()[1] for which in gains}
-    return Comparison(arm, gains, conditions, tuning_poses(arm, poses, SEED), measures, responses)
+    return Comparison(arm, gains, conditions, tuning_poses(arm, poses, SEED), settling, responses)
 
 
 def _tune_joint(name: str, joint: int) -> JointProcedure:
     return tune_joint(JointOnBench(bench_of(name), joint))
 
 
-def _step(name: str, condition: Condition, poses: int, pose: int, gains: Gains) -> tuple[StepMeasures, Response]:
+def _step(name: str, condition: Condition, poses: int, pose: int, gains: Gains) -> tuple[NDArray[np.float64], Response]:
     bench = bench_of(name, condition)
     response = run_step(bench, tuning_poses(bench.arm, poses, SEED)[pose], gains)
-    return measure_step(bench.arm, response), response
+    return settling_times(bench.arm, response), response

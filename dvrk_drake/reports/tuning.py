@@ -13,7 +13,7 @@ from dvrk_drake.experiments.tuning_model_based import ArmDesign, JointDesign, fr
 from dvrk_drake.experiments.tuning_procedure import JointProcedure
 from dvrk_drake.models.arm import Arm
 from dvrk_drake.reports.colours import COMMANDED, LIMIT, REFERENCE
-from dvrk_drake.reports.page import Block, Page, Plot, Section, Table, Text
+from dvrk_drake.reports.page import Block, Page, Plot, Section, Table
 from dvrk_drake.reports.plot import Curve, Guide, Mark, Panel, joint_label, series
 
 
@@ -29,14 +29,14 @@ def tuning_page(tuning: Tuning, *, gains_path: str | None = None) -> Page:
     """
     comparison, name = tuning.comparison, tuning.arm.source
     best = comparison.best(tuning.found)
-    found, own = (_settled(comparison.table(which, "settling").ravel()) for which in (best, OWN))
+    found, own = (_settled(comparison.settling[which].ravel()) for which in (best, OWN))
     is_better = comparison.best([OWN, best]) == best
     details: list[Block] = []
     if tuning.procedure is not None:
         details += _procedure_tables(tuning.arm, tuning.procedure)
     if tuning.design is not None:
         details += _design_tables(tuning.arm, tuning.design)
-    details += _joint_tables(comparison)
+    details.append(_joint_table(comparison))
     plots = [_step_plot(comparison), _effort_plot(comparison)] if comparison.responses else []
     return Page(
         f"Controller gains of {tuning.arm.name}, simulated",
@@ -57,7 +57,7 @@ def tuning_page(tuning: Tuning, *, gains_path: str | None = None) -> Page:
 def _summary_table(comparison: Comparison) -> Table:
     """Returns the settled steps and the mean settling time of all joints and poses, with one row per condition."""
     rows = [
-        (condition.name, *(_settled(comparison.table(g, "settling")[c].ravel()) for g in comparison.gains))
+        (condition.name, *(_settled(comparison.settling[g][c].ravel()) for g in comparison.gains))
         for c, condition in enumerate(comparison.conditions)
     ]
     return Table(
@@ -130,38 +130,26 @@ def _design_tables(arm: Arm, design: ArmDesign) -> list[Block]:
     return [table, _gains(f"{arm.name}, gains of the model-based design", arm, design.joints)]
 
 
-def _joint_tables(comparison: Comparison) -> list[Block]:
-    """Returns one table per joint with the settling times and other measures of all gains."""
-    arm, poses = comparison.arm, len(comparison.poses)
-    blocks: list[Block] = [
-        Text(
-            "Settling time [s] of the slowest pose. The settling band is 2 % of the step, but at least one encoder "
-            f"count. n/{poses}: not settled within {DURATION - REST_TIME:g} s at n poses. Overshoot, steady-state "
-            "error and ripple (peak-to-peak effort at rest / effort limit): largest values over all poses, if the arm "
-            "equals its model.",
-            show="details",
-        )
-    ]
-    names = [condition.name for condition in comparison.conditions]
+def _joint_table(comparison: Comparison) -> Table:
+    """Returns the largest settling time of each joint with all gains, or the number of steps that do not settle."""
+    arm, rows = comparison.arm, []
     for j, joint in enumerate(arm.joint_names):
-        unit, size = "mm" if arm.prismatic[j] else "mrad", step_size(arm)[j]
-        rows = []
-        for which in comparison.gains:
-            settling = comparison.table(which, "settling")[:, :, j]
-            overshoot, error, ripple = (
-                comparison.table(which, name)[0, :, j].max() for name in ("overshoot", "steady_error", "oscillation")
-            )
-            measures = (f"{100 * overshoot:.0f} %", f"{1e3 * error:.2f}", f"{100 * ripple:.1f} %")
-            rows.append((which, *map(_slowest, settling), *measures))
-        title = f"{joint}, step {1e3 * size:g} {unit}, band {1e3 * band(arm)[j]:.2g} {unit}"
-        header = ("", *names, "overshoot", f"error [{unit}]", "ripple")
-        blocks.append(Table(header, rows, title, show="details"))
-    return blocks
+        unit = "mm" if arm.prismatic[j] else "mrad"
+        step = f"{1e3 * step_size(arm)[j]:g} {unit}, band {1e3 * band(arm)[j]:.2g} {unit}"
+        rows.append((joint, step, *(_slowest(settling[:, :, j]) for settling in comparison.settling.values())))
+    return Table(
+        ("", "step", *comparison.settling),
+        rows,
+        "Largest settling time of each joint [s] over all conditions and poses",
+        "Settling band: 2 % of the step, but at least one encoder count. a/b: a of b steps do not settle within "
+        f"{DURATION - REST_TIME:g} s.",
+        show="details",
+    )
 
 
 def _slowest(settling: NDArray[np.float64]) -> str:
     failed = int(np.count_nonzero(~np.isfinite(settling)))
-    return f"{failed}/{len(settling)}" if failed else f"{settling.max():.2f}"
+    return f"{failed}/{settling.size}" if failed else f"{settling.max():.2f}"
 
 
 def _settled(settling: NDArray[np.float64]) -> str:

@@ -15,10 +15,8 @@ from dvrk_drake.experiments.scenario import load_scenario
 from dvrk_drake.experiments.tuning import (
     CONDITIONS,
     DURATION,
-    REST_TIME,
     Comparison,
-    StepMeasures,
-    measure_step,
+    settling_times,
     tune_arm,
 )
 from dvrk_drake.experiments.tuning_bench import Bench, JointOnBench, Response, band, step_size
@@ -222,41 +220,29 @@ def test_design_keeps_margins_and_reports_limitation():
     assert delayed.frequency < 0.8 * design_joint(joint, sampling).frequency
 
 
-def test_measures_of_known_step():
+def test_settling_times_of_known_steps():
     arm = load_arm("psm")
     n, t = arm.num_joints, 1e-3 * np.arange(round(1e3 * DURATION) + 1)
-    q = np.zeros((len(t), n))
     goal, w = step_size(arm), 10.0
-    q[:] = goal * (1 - np.exp(-w * t))[:, None]
-    q[:, 1] = goal[1] * (1 - np.exp(-w * t) * (np.cos(3 * w * t) + np.sin(3 * w * t) / 3))  # zero initial speed
-    q[:, 2] = 0.5 * goal[2]
-    q[:, 3] = goal[3] * (1 + 0.1 * np.sin(50 * t)) - goal[3] * (t == 0)
-    effort = np.zeros((len(t), n))
-    effort[:, 4] = 0.1 * arm.effort_limits[4] * np.sin(50 * t)
-    effort[t < DURATION - REST_TIME, 5] = arm.effort_limits[5]  # nonzero effort during the motion, zero at the end
-    measured = measure_step(arm, Response(t, q, q, effort, goal))
-    assert measured.settling[0] == pytest.approx(np.log(goal[0] / band(arm)[0]) / w, abs=2e-3)
-    assert measured.overshoot[0] == 0.0
-    # The speed is 10/3 w exp(-w t) sin(3 w t), so the first and largest peak is at 3 w t = pi.
-    assert measured.overshoot[1] == pytest.approx(np.exp(-np.pi / 3), rel=1e-3)
-    assert np.isinf(measured.settling[2])
-    assert measured.steady_error[2] == pytest.approx(0.5 * goal[2])
-    assert np.isinf(measured.settling[3])  # it enters the band repeatedly but never stays
-    assert measured.overshoot[3] == pytest.approx(0.1, rel=1e-2)
-    np.testing.assert_allclose(measured.oscillation, [0, 0, 0, 0, 0.2, 0, 0], rtol=1e-2, atol=1e-12)
+    q = goal * (1 - np.exp(-w * t))[:, None]
+    q[:, 1] = 0.5 * goal[1]
+    q[:, 2] = goal[2] * (1 + 0.1 * np.sin(50 * t)) - goal[2] * (t == 0)
+    settling = settling_times(arm, Response(t, q, q, np.zeros((len(t), n)), goal))
+    assert settling[0] == pytest.approx(np.log(goal[0] / band(arm)[0]) / w, abs=2e-3)
+    assert np.all(np.isinf(settling[1:3]))  # the first never enters the band, the second does not stay
 
 
 def test_best_gains_settle_most_often_then_fastest():
     arm = load_arm("psm")
-    never, rest = np.full(7, np.inf), np.zeros(7)
+    never = np.full(7, np.inf)
     settling = {
         "fails": np.r_[np.inf, np.full(6, 0.1)],
         "slow": np.full(7, 0.9),
         "fast": np.full(7, 0.8),
         "never": never,
     }
-    measures = {name: [[StepMeasures(times, rest, rest, rest)]] for name, times in settling.items()}
-    comparison = Comparison(arm, {}, CONDITIONS[:1], np.zeros((1, 7)), measures, {})
+    arrays = {name: times[None, None] for name, times in settling.items()}
+    comparison = Comparison(arm, {}, CONDITIONS[:1], np.zeros((1, 7)), arrays, {})
     assert comparison.best(settling) == "fast"
     assert comparison.best(["never", "fails", "slow"]) == "slow"
     assert comparison.best(["never", "fails"]) == "fails"
@@ -311,7 +297,7 @@ def test_psm_insertion_ultimate_gain_matches_analytic():
 def test_designed_gains_settle_all_psm_joints(tmp_path, monkeypatch):
     monkeypatch.setattr("dvrk_drake.experiments.tuning.local_executor", partial(local_executor, 1))
     tuning = tune_arm("psm", ["model"], conditions=CONDITIONS[:1], poses=1)
-    settling = tuning.comparison.table("model", "settling")
+    settling = tuning.comparison.settling["model"]
     assert np.all(np.isfinite(settling))
     assert tuning.found == {"model": tuning.design.gains}
     text = printed(tuning_page(tuning), verbose=True)

@@ -7,7 +7,7 @@ from dvrk_drake.experiments.study import RandomPoses, Study, Variation
 from dvrk_drake.experiments.study_measures import Measure
 from dvrk_drake.experiments.study_run import Row
 from dvrk_drake.experiments.transparency import OperatorForces
-from dvrk_drake.experiments.tuning import CONDITIONS, OWN, PUBLISHED, Comparison, StepMeasures, Tuning
+from dvrk_drake.experiments.tuning import CONDITIONS, OWN, PUBLISHED, Comparison, Tuning
 from dvrk_drake.experiments.tuning_bench import Response, step_size
 from dvrk_drake.experiments.tuning_model_based import ArmDesign, JointDesign, JointProperties, Margins
 from dvrk_drake.experiments.tuning_procedure import JointProcedure, Ultimate
@@ -33,15 +33,10 @@ def tuning_result():
     names = (OWN, PUBLISHED, "paper", "model")
     settling = {name: k for k, name in enumerate(reversed(names))}
     n, q = arm.num_joints, arm.sample_poses(6, np.random.default_rng(0))
-    measures = {
-        name: [
-            [StepMeasures(np.where(np.arange(n) < settling[name], np.inf, 0.5), *np.full((3, n), 0.12)) for _ in q]
-            for _ in CONDITIONS
-        ]
-        for name in names
-    }
+    shape = (len(CONDITIONS), len(q), n)
+    times = {name: np.broadcast_to(np.where(np.arange(n) < settling[name], np.inf, 0.5), shape) for name in names}
     responses = {name: _response(arm, q[0], 3.0 + k) for k, name in enumerate(names)}
-    comparison = Comparison(arm, dict.fromkeys(names, arm.gains), CONDITIONS, q, measures, responses)
+    comparison = Comparison(arm, dict.fromkeys(names, arm.gains), CONDITIONS, q, times, responses)
     procedure = JointProcedure(1.2, 0.3, 0.5, Ultimate(1234.5, 0.123, 1.01, False), 1.0, False, 1.234e-3)
     properties = JointProperties((1.23e-4, 4.56e-3), 0.1, 0.1, 1.0, 1e-4, 1e-3, 3.0)
     design = JointDesign(1.2, 0.3, 0.5, 123.4, (Margins(0.7, 100.0, 2.3),) * 2, "phase margin")
