@@ -234,3 +234,28 @@ def test_arm_without_dh_frames_has_a_gravity_model(tmp_path):
     q = each_arm.sample_poses(20, np.random.default_rng(1))
     tau = IdentifiedModel.from_arm(plain).holding_torque(q)
     np.testing.assert_allclose(tau, holding_torques(each_arm, q), rtol=0, atol=1e-12 * np.abs(tau).max())
+
+
+@pytest.mark.parametrize(
+    ("name", "labels"),
+    [
+        ("mtmr", "1 2 3 4 5 6 7 crank coupler"),
+        ("psm", "1 2 3 4 5 6 back_crank bottom_bar top_bar front_crank counterweight finger_1 finger_2"),
+    ],
+)
+def test_symbolic_frames_equal_those_of_the_plant(random_q, name, labels):
+    arm = load_arm(name)
+    symbolic = SymbolicPlant(arm)
+    poses = symbolic.frame_poses()
+    assert set(poses) == set(labels.split())
+    plant = make_arm_plant(arm)
+    context = plant.CreateDefaultContext()
+    zero = plant.GetFrameByName("dh_0")
+    for label, X_0F in poses.items():
+        frame = plant.GetFrameByName(f"dh_{label}")
+        function = sympy.lambdify([*symbolic.q], X_0F, modules="numpy")
+        for q in random_q[:10]:
+            set_arm_positions(plant, context, arm, q)
+            np.testing.assert_allclose(
+                np.array(function(*q), float), frame.CalcPose(context, zero).GetAsMatrix4(), atol=1e-12
+            )
