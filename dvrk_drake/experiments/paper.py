@@ -1,4 +1,4 @@
-"""Numbers and recordings that the paper's team published, and conversion of its parameters to a model."""
+"""Numbers and recordings that the paper's team published, and the arms and models that its reproduction shares."""
 
 from __future__ import annotations
 

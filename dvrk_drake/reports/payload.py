@@ -78,7 +78,7 @@ def _estimate_table(payload: Payload) -> Table:
     rows = [("mass [kg]", f"{payload.body.mass:.4f}", _mass_interval(payload), "")]
     position = zip(payload.body.position, payload.position_error, payload.position_in_base, strict=True)
     for axis, determined, (x, error, base) in zip("xyz", payload.body.determined, position, strict=True):
-        numbers = (f"{x:+.4f}", _interval(x, error, payload), f"{base:+.4f}")
+        numbers = (f"{x:.4f}", _interval(x, error, payload), f"{base:.4f}")
         rows.append((f"{axis} [m]", *(numbers if determined else ("not determined", "", ""))))
     header = ("", "estimate", f"{100 * CONFIDENCE:.0f} % interval", "base frame, q = 0")
     return Table(header, rows, f"Payload on {payload.link}, position in the frame of the link")
