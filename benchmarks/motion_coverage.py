@@ -84,7 +84,7 @@ def errors(arm: Arm, seed: int, noise: float, spread: float) -> tuple[np.ndarray
     chosen = np.arange(len(truth.effects))
     selection = problem.selection()
     selection.fit_with(chosen)
-    fit = ConsistentFit(problem, chosen, selection.weights)
+    fit = ConsistentFit(problem, chosen, selection.selection.weights)
     residual = problem.columns.tau - problem.predict(chosen, fit.x)
     cut_off = grid.settings.effort_cut_off
     series = [ResidualSeries(slice(0, len(residual)), grid.rate, period)]

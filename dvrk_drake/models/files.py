@@ -21,14 +21,6 @@ MAX_TEXT = 4_000_000
 #: Maximum size of a file of any other format, if it is read completely into memory [bytes].
 MAX_BINARY = 256_000_000
 
-_KINDS = {
-    stat.S_IFDIR: "a folder",
-    stat.S_IFIFO: "a FIFO",
-    stat.S_IFSOCK: "a socket",
-    stat.S_IFCHR: "a device",
-    stat.S_IFBLK: "a device",
-}
-
 
 def open_input(path: str | Path, error: type[DvrkDrakeError], largest: int | None = None) -> FileIO:
     """Opens a regular file for reading, unbuffered.
@@ -58,8 +50,7 @@ def open_input(path: str | Path, error: type[DvrkDrakeError], largest: int | Non
     status = os.fstat(file.fileno())
     if not stat.S_ISREG(status.st_mode):
         file.close()
-        kind = _KINDS.get(stat.S_IFMT(status.st_mode), "of unknown type")
-        raise error(f"{path} is not a file but {kind}; copy its content to a file first")
+        raise error(f"{path} is not a regular file; copy its content to a file first")
     if largest is not None and status.st_size > largest:
         file.close()
         raise error(f"{path} has {status.st_size / 1e6:.1f} MB; allowed: at most {largest / 1e6:g} MB")

@@ -25,7 +25,7 @@ from dvrk_drake.recordings.csv_files import (
     read_numbers,
 )
 from dvrk_drake.recordings.joint_states import MESSAGE_BLOCKS, JointState, collect_joint_states, joint_recording
-from dvrk_drake.recordings.reader_options import FileOptions, check_namespace, instrument_notes, sha256_of
+from dvrk_drake.recordings.reader_options import WPI_JOINTS, FileOptions, check_namespace, instrument_notes, sha256_of
 from dvrk_drake.recordings.recording import FileCoordinates, Recording
 
 #: Columns with the same text in each row. `write_recording` and `collect` write them.
@@ -44,8 +44,6 @@ _QUANTITIES = {
     **dict.fromkeys(("velocity", "vel"), "qd"),
     **dict.fromkeys(("effort", "torque", "force"), "tau"),
 }
-#: Number of joints of the arms that WPI recorded without a header.
-_WPI_JOINTS = 7
 #: Names of the column with the times in a file whose columns have the names of joints.
 _TIME_NAMES = ("t", "time", "timestamp")
 
@@ -235,11 +233,11 @@ def _layout(path: Path, where: str, width: int, options: FileOptions) -> _Layout
     columns = {name: [f"{name}{i}" for i in range(1, n + 1)] for name in ("q", "qd", "tau")}
     if width == 3 * n:
         # Motions of WPI (https://github.com/WPI-AIM/dvrk_dynamics_identification).
-        is_wpi = n == _WPI_JOINTS and (arm is None or is_package_arm(arm))
+        is_wpi = n == WPI_JOINTS and (arm is None or is_package_arm(arm))
         return _Layout([*columns["q"], *columns["qd"], *columns["tau"]], *((200.0, "wpi") if is_wpi else ()))
     # Script `dvrk_ecm_psm_gc_collect.py` of the dVRK (https://github.com/jhu-dvrk/dvrk_python), for three joints. In
     # static poses of WPI (https://github.com/WPI-AIM/dvrk_gravity_comp), a column of the gripper follows the joints.
-    has_gripper = n == _WPI_JOINTS and width == 2 * n + 2
+    has_gripper = n == WPI_JOINTS and width == 2 * n + 2
     if width == 2 * n or has_gripper:
         return _Layout([name for prefix in ("q", "tau") for name in (*columns[prefix], *[""] * has_gripper)])
     message = (

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from dvrk_drake.errors import RecordingError
 from dvrk_drake.models.files import read_input
 from dvrk_drake.recordings.csv_files import listed
-from dvrk_drake.recordings.reader_options import FileOptions, sha256_of
+from dvrk_drake.recordings.reader_options import WPI_JOINTS, FileOptions, sha256_of
 from dvrk_drake.recordings.recording import Recording
 
 _SUFFIXES = (".mat", ".npz")
@@ -49,7 +49,7 @@ _NAMES = {
 }
 #: First dimensions (7 joints and gripper; position, effort) of an array of static poses. It is allocated before the
 #: measurement, so a pose of only zeros was not recorded.
-_POSE_SHAPE, _POSE_JOINTS = (8, 2), 7
+_POSE_SHAPE = WPI_JOINTS + 1, 2
 #: Maximum number of arrays listed in a message.
 _LISTED = 12
 
@@ -295,7 +295,7 @@ def _chosen(path: Path, content: _Content, n: int, names: Mapping[str, str]) -> 
             chosen[quantity] = fitting[0]
     if "q" in chosen:
         return chosen
-    poses = [name for name, array in content.arrays.items() if _is_pose_array(array) and n == _POSE_JOINTS]
+    poses = [name for name, array in content.arrays.items() if _is_pose_array(array) and n == WPI_JOINTS]
     if names or not poses:
         raise RecordingError(
             f"{path}: no array of {n} joints has a recognised name. Name the arrays with --arrays q=NAME tau=NAME "
@@ -325,8 +325,8 @@ def _is_pose_array(array: NDArray) -> bool:
 
 
 def _poses(path: Path, name: str, array: NDArray, n: int) -> _Rows:
-    if n != _POSE_JOINTS:
-        raise RecordingError(f"{path}: an array of poses contains {_POSE_JOINTS} joints, but the arm has {n}")
+    if n != WPI_JOINTS:
+        raise RecordingError(f"{path}: an array of poses contains {WPI_JOINTS} joints, but the arm has {n}")
     if not _is_pose_array(array):
         raise RecordingError(f"{path}: {name} is {_shape(array)}; allowed: 8 x 2 x N (joint; position, effort; pose)")
     q, tau = np.asarray(array, float).reshape(*_POSE_SHAPE, -1).transpose(1, 2, 0)[..., :n]

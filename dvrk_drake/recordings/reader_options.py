@@ -19,8 +19,8 @@ from dvrk_drake.models.arm_files import is_package_arm
 from dvrk_drake.models.files import open_input
 from dvrk_drake.recordings.recording import FileCoordinates, Recording, file_transmission
 
-#: Number of joints of a file that is read without an arm.
-_DEFAULT_JOINTS = 7
+#: Number of joints of the arms whose public recordings state no joints, and of a file that is read without an arm.
+WPI_JOINTS = 7
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +40,7 @@ class FileOptions:
     @property
     def num_joints(self) -> int:
         """Number of joints in the file."""
-        return self.arm.num_joints if self.arm else _DEFAULT_JOINTS
+        return self.arm.num_joints if self.arm else WPI_JOINTS
 
     @property
     def joint_labels(self) -> list[str]:

@@ -37,24 +37,17 @@ class EffectSelection:
             components of the tilt.
         mandatory: Indices (s,) of the mandatory effects and of the tilt, in this order.
         selected: Indices (f,) of all included effects and of the tilt, in ascending order.
-        coefficients: Estimates (k,) of all unknowns of `selection`, 0 for effects that are not included.
     """
 
     problem: DynamicProblem
     selection: StepwiseSelection
     mandatory: NDArray[np.int_]
     selected: NDArray[np.int_]
-    coefficients: NDArray[np.float64]
 
     @property
     def effects(self) -> NDArray[np.int_]:
         """Indices (e,) of all included effects, without the tilt."""
         return self.selected[self.selected < self.problem.num_effects]
-
-    @property
-    def weights(self) -> NDArray[np.float64]:
-        """Weights (s, n) of the squared errors of the actuators in each of s recordings."""
-        return self.selection.weights
 
     def consistent(self) -> tuple[EffectSelection, ConsistentFit]:
         """Returns the physically consistent fit, and the selection with the loads of the drives that follow from it.
@@ -62,10 +55,10 @@ class EffectSelection:
         Raises:
             IdentificationError: The solver did not converge.
         """
-        selection, fit = self, ConsistentFit(self.problem, self.effects, self.weights)
+        selection, fit = self, ConsistentFit(self.problem, self.effects, self.selection.weights)
         if self.problem.is_loaded:
             selection = replace(self, problem=self.problem.with_fit(fit))
-            fit = ConsistentFit(selection.problem, self.effects, self.weights)
+            fit = ConsistentFit(selection.problem, self.effects, self.selection.weights)
         return selection, fit
 
 
@@ -100,7 +93,7 @@ def select_effects(problem: DynamicProblem, progress: Callable[[float], object] 
     selection = problem.selection(phi)
     selected = selection.select(mandatory, problem.candidates, lambda share: progress(0.5 + 0.5 * share))
     x = selection.fit_with(selected)
-    return EffectSelection(replace(problem, tilt=x[-tilts:]) if tilts else problem, selection, mandatory, selected, x)
+    return EffectSelection(replace(problem, tilt=x[-tilts:]) if tilts else problem, selection, mandatory, selected)
 
 
 def _with_link_scale(problem: DynamicProblem, mandatory: NDArray[np.int_]) -> DynamicProblem:

@@ -48,8 +48,6 @@ class MotionSignals:
         v: Velocities (m, n), low-pass filtered [rad/s, m/s].
         vd: Accelerations (m, n), low-pass filtered [rad/s^2, m/s^2].
         tau: Efforts (m, n), not filtered [N m, N]. Use the same filter for efforts and regressors, see `low_pass`.
-        rows: Indices (k,) of the rows of the recording that are used. Rows that repeat the previous row are not used.
-        row_times: True times (k,) of these rows, see `true_time` [s].
     """
 
     t: NDArray[np.float64]
@@ -57,8 +55,6 @@ class MotionSignals:
     v: NDArray[np.float64]
     vd: NDArray[np.float64]
     tau: NDArray[np.float64]
-    rows: NDArray[np.int_]
-    row_times: NDArray[np.float64]
 
     @property
     def rate(self) -> float:
@@ -99,7 +95,7 @@ def motion_signals(
         agrees = velocity_agreement(q, qd, rate).agrees
         v = np.where(agrees, qd, v)
     vd = low_pass(central_difference(v, rate), rate, acceleration_cut_off)
-    return MotionSignals(t, q, v, vd, resample(clock.t, tau, t), clock.rows, clock.t)
+    return MotionSignals(t, q, v, vd, resample(clock.t, tau, t))
 
 
 def even_times(clock: TrueTime, rate: float) -> NDArray[np.float64]:

@@ -242,7 +242,6 @@ def test_signals_reproduce_the_motion(velocities):
     np.testing.assert_allclose(signals.v[inner], v[inner], atol=5e-3)
     np.testing.assert_allclose(signals.vd[inner], vd[inner], atol=0.02 * np.abs(vd).max())
     np.testing.assert_allclose(signals.tau[inner], (2.0 * vd + q)[inner], atol=0.05)
-    np.testing.assert_array_equal(signals.rows, np.arange(3000))
     with pytest.raises(RecordingError, match="has no efforts"):
         motion_signals(replace(recording, tau=None), true_time(replace(recording, tau=None)), 20.0)
 
@@ -260,7 +259,7 @@ def delayed(lag, coulomb=0.3):
         return coulomb * np.tanh(v / (0.1 * speed)) + 0.2 * v + 0.05 * vd + np.sin(q)
 
     noise = 0.02 * np.random.default_rng(1).normal(size=(len(t), 3))
-    return MotionSignals(t, *oscillation(t), tau(t - lag) + noise, np.arange(len(t)), t)
+    return MotionSignals(t, *oscillation(t), tau(t - lag) + noise)
 
 
 @pytest.mark.parametrize("lag", [-0.01, 0.0, 0.005, 0.018])
@@ -287,7 +286,7 @@ def test_significance_of_friction_does_not_grow_with_repetitions():
     once = effort_lag(signals, np.ones(3, bool))
     repeated = {name: np.tile(getattr(signals, name), (8, 1)) for name in ("q", "v", "vd", "tau")}
     t = np.arange(len(repeated["q"])) / signals.rate
-    found = effort_lag(replace(signals, **repeated, t=t, row_times=t, rows=np.arange(len(t))), np.ones(3, bool))
+    found = effort_lag(replace(signals, **repeated, t=t), np.ones(3, bool))
     # The ends of the motion are omitted once instead of eight times.
     np.testing.assert_allclose(found.coulomb / found.coulomb_error, once.coulomb / once.coulomb_error, rtol=0.1, atol=0)
 
