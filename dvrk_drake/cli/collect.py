@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import sys
 import termios
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -77,7 +74,7 @@ def teach(
     """
     controlled.check(lcm={"reset": controlled.reset})
     support.check_output(poses, overwrite=True)
-    with _connection(controlled, keys=True) as connection:
+    with connect_arm(controlled, keys=True) as connection:
         print(f"{'Enter or one second of rest' if at_rest else 'Enter'} adds a pose, Ctrl-C ends", flush=True)
         count = connection.teach(poses, at_rest=at_rest)
     support.print_written(poses, f"{count} poses; the arm holds its pose")
@@ -119,7 +116,7 @@ def collect_poses(
     support.check_output(output, poses, controlled.model or "", overwrite=True)
     given = {} if max_effort is None else {"max_effort": max_effort}
     confirms = controlled.is_ros and not yes
-    with _connection(
+    with connect_arm(
         controlled, keys=controlled.is_ros, confirms=confirms, stop_on_contact=stop_on_contact
     ) as connection:
         settings = dvrk.CollectionSettings(traverse_time, both_sides, **given)
@@ -167,7 +164,7 @@ def collect_motion(
     support.check_output(motion, overwrite=True)
     if output is not None:
         support.check_output(output, motion, controlled.model or "", overwrite=True)
-    with _connection(controlled, keys=True, stop_on_contact=stop_on_contact) as connection:
+    with connect_arm(controlled, keys=True, stop_on_contact=stop_on_contact) as connection:
         played = connection.play(motion, output)
     if played.path is not None:
         what = f"{played.begin:.1f} to {played.end:.1f} s of {played.duration:g} s"
@@ -184,40 +181,6 @@ def collect_motion(
     else:
         recording = Path(motion).with_suffix(".csv")
         support.suggest(f"dvrk-drake collect motion {motion} {controlled.as_text()} --output {recording}")
-
-
-@contextmanager
-def _connection(
-    controlled: options.ControlledArm, *, keys: bool, confirms: bool = False, stop_on_contact: float | None = None
-) -> Iterator[dvrk.ArmConnection]:
-    """Context with a connection to the arm, a dialog on the terminal, and the status line.
-
-    Args:
-        controlled: Options of the command.
-        keys: Whether the Enter key has an effect.
-        confirms: Whether the operator must confirm the first motion, if there is a terminal.
-        stop_on_contact: See `dvrk_drake.connect`.
-    """
-    from dvrk_drake.processes.control import LiveLine
-    from dvrk_drake.processes.teacher import EnterKey
-
-    line = LiveLine(sys.stderr)
-    has_keys = keys and sys.stdin is not None and sys.stdin.isatty()
-    enter = EnterKey(sys.stdin) if has_keys else None
-
-    def confirm() -> None:
-        if confirms and enter is not None:
-            print("Clear the workspace of the arm. Enter starts the motion, Ctrl-C ends the command.", flush=True)
-            while not connection.dialog.stopped() and not enter():
-                time.sleep(0.02)
-
-    dialog = dvrk.Dialog(confirm=confirm, enter=enter, report=line.report, show=line.show)
-    with support.interrupt_ends_process():
-        connection = connect_arm(controlled, dialog, stop_on_contact=stop_on_contact)
-        try:
-            yield connection
-        finally:
-            line.clear()
 
 
 @options.app.command(group=options.HARDWARE)
@@ -276,16 +239,8 @@ def calibrate(
     support.print_line(
         f"{result.duration / 60:.1f} min in total, of which the arm was controlled for {result.moving / 60:.1f} min"
     )
-    for file, what in (
-        ("report.html", "errors and verdict of the full dynamics"),
-        ("holding_report.html", "errors and verdict of its holding torques at other poses"),
-        ("static_report.html", "errors and verdict of the static model"),
-        ("model_report.html", "parameters of the full dynamics"),
-        ("model.sdf", "full dynamics for Drake"),
-        ("gravity.json", "gravity compensation of the dVRK"),
-    ):
-        if (result.folder / file).exists():
-            support.print_written(result.folder / file, what)
+    for path, what in result.files().items():
+        support.print_written(path, what)
     if result.is_usable:
         model = result.folder / "model.yaml"
         support.print_line(f"In the driver's configuration of the arm: model: {model.resolve()}")

@@ -5,18 +5,16 @@ from __future__ import annotations
 import contextlib
 import signal
 import sys
-from contextlib import closing, suppress
-from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager, suppress
+from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
 import dvrk_drake as dvrk
 from dvrk_drake.cli import options, support
 from dvrk_drake.errors import ControllerError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 
 @options.app.command(group=options.HARDWARE)
@@ -57,33 +55,28 @@ def control(
         hysteresis_ratio: Share of the wide hysteresis to compensate in the modes gravity and guide, 0 to 0.9.
         friction_model: Model with the friction parameters, identified from a motion. Default: the model of --model.
     """
-    from dvrk_drake.processes.control import LiveLine, LiveStatus
+    from dvrk_drake.processes.control import LiveStatus
 
     controlled.check(lcm={"reset": controlled.reset})
-    line, printed = LiveLine(sys.stderr), [("", "")]
+    printed = [("", "")]
 
     def show(status: LiveStatus) -> None:
         # Over ROS 2, the guard in this process reports the changes of its state.
         if (current := ("" if controlled.is_ros else status.state, status.problem)) == printed[0]:
-            line.show(lambda: str(status))
-            return
-        printed[0] = current
-        line.clear()
-        print(status, flush=True)
+            connection.dialog.show(lambda: str(status))
+        else:
+            printed[0] = current
+            connection.dialog.report(str(status))
 
-    try:
-        with support.interrupt_ends_process():
-            connection = connect_arm(controlled, dvrk.Dialog(report=support.print_line), publish_force=publish_force)
-            connection.run(
-                mode,
-                gains=gains,
-                friction_ratio=friction_ratio,
-                hysteresis_ratio=hysteresis_ratio,
-                friction_model=friction_model,
-                report=show,
-            )
-    finally:
-        line.clear()
+    with connect_arm(controlled, publish_force=publish_force) as connection:
+        connection.run(
+            mode,
+            gains=gains,
+            friction_ratio=friction_ratio,
+            hysteresis_ratio=hysteresis_ratio,
+            friction_model=friction_model,
+            report=show,
+        )
     support.print_line(f"control ended; {connection.arm.name} holds its pose")
 
 
@@ -128,24 +121,50 @@ def stop(*, connected: options.ConnectedArm, power_off: bool = False) -> None:
     support.print_line(f"{connection.arm.name} is stopped: {connection.hold(power_off=power_off)}")
 
 
-def connect_arm(controlled: options.ControlledArm, dialog: dvrk.Dialog, **settings: Any) -> dvrk.ArmConnection:
-    """Returns the connection to the arm that the options of a command define. See `dvrk_drake.connect` for `settings`.
+@contextmanager
+def connect_arm(
+    controlled: options.ControlledArm, *, keys: bool = False, confirms: bool = False, **settings: Any
+) -> Iterator[dvrk.ArmConnection]:
+    """Context with the connection to the arm that the options of a command define, a dialog, and the status line.
 
-    Use the connection within `interrupt_ends_process`. Ctrl-C then ends the process at once, until this process
-    commands the arm. From then on, `dialog.stopped` returns true after Ctrl-C.
+    Ctrl-C ends the process at once, until this process commands the arm. From then on, `dialog.stopped` returns true
+    after Ctrl-C.
+
+    Args:
+        controlled: Options of the command.
+        keys: Whether the Enter key has an effect.
+        confirms: Whether the operator must confirm the first motion, if there is a terminal.
+        settings: See `dvrk_drake.connect`.
     """
+    from dvrk_drake.processes.control import LiveLine
     from dvrk_drake.processes.pace import settle_memory
     from dvrk_drake.processes.simulated_arm import stop_on_signals
+    from dvrk_drake.processes.teacher import EnterKey
 
-    handlers: list[Callable[[], bool]] = []
+    line, handlers = LiveLine(sys.stderr), list[Callable[[], bool]]()
+    has_keys = keys and sys.stdin is not None and sys.stdin.isatty()
+    enter = EnterKey(sys.stdin) if has_keys else None
+
+    def stopped() -> bool:
+        return any(handler() for handler in handlers)
 
     def ready() -> None:
         handlers.append(stop_on_signals())
         settle_memory()
         support.request_realtime(controlled.realtime)
 
-    dialog = replace(dialog, stopped=lambda: any(handler() for handler in handlers))
-    return controlled.connect(dialog, model=controlled.model, reset=controlled.reset, ready=ready, **settings)
+    def confirm() -> None:
+        if confirms and enter is not None:
+            print("Clear the workspace of the arm. Enter starts the motion, Ctrl-C ends the command.", flush=True)
+            while not stopped() and not enter():
+                time.sleep(0.02)
+
+    dialog = dvrk.Dialog(stopped=stopped, confirm=confirm, enter=enter, report=line.report, show=line.show)
+    with support.interrupt_ends_process():
+        try:
+            yield controlled.connect(dialog, model=controlled.model, reset=controlled.reset, ready=ready, **settings)
+        finally:
+            line.clear()
 
 
 @options.bridge.default

@@ -52,6 +52,7 @@ def check(
 
     The exit code is 2 if the recording is not suitable for identification.
     """
+    from dvrk_drake.analysis.check.recording_check import other_arm
     from dvrk_drake.models.locked_joints import locked_option
     from dvrk_drake.reports.recording_check import check_page, has_spectra
 
@@ -64,7 +65,7 @@ def check(
         checked = file.read(recording, recorded_arm, steps)
         report = dvrk.check(checked, identified or recorded_arm, progress=steps)
     options = f"--arm {arm}{locked_option(recorded_arm)}" if model is None else f"--model {model}"
-    other = _other_arm(checked, recorded_arm)
+    other = other_arm(checked, recorded_arm)
     page = check_page(
         report,
         source=options + file.as_text(),
@@ -80,23 +81,6 @@ def check(
         print(f"dvrk-drake: {refusal}", file=sys.stderr)
     if report.refusals:
         raise RecordingError(report.refusal)
-
-
-def _other_arm(recording: dvrk.Recording, arm: dvrk.Arm) -> str:
-    """Returns the arm of a recording that is outside the limits of `arm`, "ARM" if several arms fit, "" if none."""
-    from dvrk_drake.models.arm_files import known_arms
-
-    def fits(tested: dvrk.Arm) -> bool:
-        try:
-            recording.check_fits(tested)
-        except RecordingError:
-            return False
-        return True
-
-    if arm.locked_joints or fits(arm):
-        return ""
-    fitting = [name for name in known_arms() if fits(dvrk.load_arm(name))]
-    return fitting[0] if len(fitting) == 1 else "ARM" if fitting else ""
 
 
 @options.app.command(group=options.IDENTIFY)

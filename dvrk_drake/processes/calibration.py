@@ -120,6 +120,18 @@ class Calibration:
         """True if no joint of both models has the verdict "do not use"."""
         return not any("do not use" in _verdicts(model) for model in (self.static, self.model))
 
+    def files(self) -> dict[Path, str]:
+        """Returns the files for the user, each with a description."""
+        descriptions = {
+            "report.html": "errors and verdict of the full dynamics",
+            "holding_report.html": "errors and verdict of its holding torques at other poses",
+            "static_report.html": "errors and verdict of the static model",
+            "model_report.html": "parameters of the full dynamics",
+            "model.sdf": "full dynamics for Drake",
+            "gravity.json": "gravity compensation of the dVRK",
+        }
+        return {self.folder / name: text for name, text in descriptions.items() if (self.folder / name).exists()}
+
     def summary(self) -> list[str]:
         """Returns the joints of each verdict, in one line per model."""
         lines = []

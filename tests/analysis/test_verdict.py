@@ -28,7 +28,6 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel, ValidationSumm
 from dvrk_drake.errors import ModelError
 from dvrk_drake.models.arm_files import load_arm
 from dvrk_drake.models.effects_schema import ArmEffects, DriveEffect
-from dvrk_drake.processes.arm_session import Dialog
 from dvrk_drake.processes.connection import model_warning
 from dvrk_drake.recordings.formats import read_recording, write_recording
 from dvrk_drake.recordings.recording import Recording
@@ -236,7 +235,8 @@ def test_commands_warn_before_connecting_to_the_arm(files, capsys):
     assert main(["validate", bad, "--model", model, "--save"]) == 0
     capsys.readouterr()
     for path, warnings in ((model, 1), (None, 0)):
-        assert connect_arm(ControlledArm(arm="mtmr", model=path), Dialog(report=print)).arm.name == "MTMR"
+        with connect_arm(ControlledArm(arm="mtmr", model=path)) as connection:
+            assert connection.arm.name == "MTMR"
         assert capsys.readouterr().out.count("shoulder_pitch (do not use)") == warnings
 
 

@@ -22,6 +22,7 @@ from dvrk_drake.analysis.observations.true_time import SAME_VALUE, distinct_rows
 from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import IdentificationError, RecordingError
 from dvrk_drake.models.arm import Arm
+from dvrk_drake.models.arm_files import known_arms, load_arm
 from dvrk_drake.progress import Progress, step_progress
 from dvrk_drake.recordings.recording import (
     COORDINATES_HELP,
@@ -322,6 +323,22 @@ def check(recording: Recording, arm: Arm | IdentifiedModel, *, progress: Progres
     # A refusal of identify makes the warning of too few poses redundant.
     others = [finding for finding in report.findings if not (refusals and finding.kind == "few poses")]
     return replace(report, findings=(*refusals, *others))
+
+
+def other_arm(recording: Recording, arm: Arm) -> str:
+    """Returns the arm of a recording that is outside the limits of `arm`, "ARM" if several arms fit, "" if none."""
+
+    def fits(tested: Arm) -> bool:
+        try:
+            recording.check_fits(tested)
+        except RecordingError:
+            return False
+        return True
+
+    if arm.locked_joints or fits(arm):
+        return ""
+    fitting = [name for name in known_arms() if fits(load_arm(name))]
+    return fitting[0] if len(fitting) == 1 else "ARM" if fitting else ""
 
 
 def with_power(recording: Recording, arm: Arm) -> tuple[Recording, tuple[Finding, ...]]:
