@@ -49,8 +49,7 @@ if TYPE_CHECKING:
     from dvrk_drake.systems.force_feedback import ForceFeedback
     from dvrk_drake.systems.gravity_pid_controller import GravityPidController
     from dvrk_drake.systems.hardware_arm_station import HardwareArmStation
-    from dvrk_drake.systems.station import Station
-    from dvrk_drake.systems.station_config import load_station_config
+    from dvrk_drake.systems.station import Station, load_station_config
     from dvrk_drake.systems.teleoperated_arms import TeleoperatedArms, Wall
 
 #: Mapping from a public name to the module that defines it.
@@ -93,7 +92,7 @@ _MODULES = {
     "load_arm": "models.arm_files",
     "lock_joints": "models.locked_joints",
     "load_scenario": "experiments.scenario",
-    "load_station_config": "systems.station_config",
+    "load_station_config": "systems.station",
     "payload": "analysis.payload",
     "perturbed_arm": "experiments.ground_truth",
     "predict": "analysis.validation",

@@ -25,7 +25,7 @@ from dvrk_drake.models.ranges import within
 from dvrk_drake.models.typed_yaml import load_yaml, parse_yaml, typed_content
 from dvrk_drake.systems.gravity_pid_controller import Mode
 from dvrk_drake.systems.hand import Grip
-from dvrk_drake.systems.station_config import ArmConfig
+from dvrk_drake.systems.station import ArmConfig
 
 #: Maximum duration of a simulation [s] and minimum sample period of its recording [s].
 MAX_LENGTH, MIN_SAMPLE_PERIOD = 3600.0, 1e-3

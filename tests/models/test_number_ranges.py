@@ -37,7 +37,7 @@ from dvrk_drake.processes.collector import CollectionSettings
 from dvrk_drake.systems.driver import CrtkDriver, DvrkDriver
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 from dvrk_drake.systems.hand import Grip
-from dvrk_drake.systems.station_config import load_station_config
+from dvrk_drake.systems.station import load_station_config
 
 #: Schemas of files.
 FILES = (ArmDescription, Mechanism, Instrument, Gains, DvrkDriver, CrtkDriver, Scenario, Study, PoseFile, ModelFile)

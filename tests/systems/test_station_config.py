@@ -18,8 +18,7 @@ from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.driver import CrtkDriver
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
 from dvrk_drake.systems.hardware_arm_station import HardwareArmStation
-from dvrk_drake.systems.station import Station
-from dvrk_drake.systems.station_config import StationArm, StationConfig, load_station_config
+from dvrk_drake.systems.station import Station, StationArm, StationConfig, load_station_config
 
 pytestmark = pytest.mark.drake_api
 

@@ -24,8 +24,7 @@ from dvrk_drake.dynamics.identified_model import IdentifiedModel
 from dvrk_drake.errors import StationError
 from dvrk_drake.systems.closed_loop import add_closed_loop
 from dvrk_drake.systems.gravity_pid_controller import GravityPidController
-from dvrk_drake.systems.station import Station
-from dvrk_drake.systems.station_config import load_station_config
+from dvrk_drake.systems.station import Station, load_station_config
 
 pytestmark = [pytest.mark.network, pytest.mark.realtime]
 
