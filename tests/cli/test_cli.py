@@ -90,6 +90,28 @@ def test_predict_uses_the_coordinates_of_the_recording(folder, tmp_path, coordin
     np.testing.assert_allclose(tau, expected, atol=1e-12)
 
 
+def test_predict_of_a_psm_in_wpi_coordinates_writes_them(tmp_path):
+    """In these coordinates, the roll is that of the joint. The power is the same in all coordinates."""
+    arm = load_arm("psm")
+    path, model, out = tmp_path / "poses.csv", tmp_path / "model.yaml", tmp_path / "tau.csv"
+    joints = Recording(q=arm.sample_poses(20, np.random.default_rng(0)))
+    actuators, roll = joints.in_actuator_coordinates(arm).q, arm.joint_names.index("roll")
+    wpi = actuators.copy()
+    wpi[:, roll] = joints.q[:, roll]
+    write_recording(Recording(q=wpi), path)
+    text = path.read_text().replace("joint", "wpi")
+    path.write_text(text)
+    IdentifiedModel.from_arm(arm).save(model)
+    assert main(["predict", str(path), "--model", str(model), "--output", str(out)]) == 0
+    tau, expected = csv_block(out, "tau"), IdentifiedModel.load(model).holding_torque(joints.q)
+    assert np.abs(expected).max() > 0.1
+    velocity = np.random.default_rng(1).normal(size=7)
+    velocity_wpi = arm.transmission.velocity(velocity)
+    velocity_wpi[roll] = velocity[roll]
+    np.testing.assert_allclose(tau @ velocity_wpi, expected @ velocity, atol=1e-9)
+    assert out.read_text().splitlines()[1].endswith(",wpi,PSM")
+
+
 def test_exported_python_and_c_match_the_plant(tmp_path, capsys):
     arm = load_arm("mtml")
     model = static_model(arm)

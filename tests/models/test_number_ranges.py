@@ -228,6 +228,7 @@ LIMITS, COUPLED = "position_limits", "coupled_limits"
         ("arm", (LIMITS, "yaw"), [1.0, 1.001], r"yaw: upper - lower is 0\.001; allowed: 0\.01\.\.25\.2 rad"),
         ("arm", (LIMITS, "insertion"), [0.1, 0.1001], r"insertion: upper - lower is 0\.0001; allowed: 0\.001\.\.30 m"),
         ("mechanism", (COUPLED,), [{**SUM, "coefficients": {"yaw": 0.0}}], r"coupled_limits\.sum: all coefficients"),
+        ("mechanism", (COUPLED,), [{**SUM, "coefficients": {"arm": 1.0}}], r'coupled_limits\.sum: unknown joint "arm"'),
         ("mechanism", (COUPLED,), [{**SUM, "coefficients": {"yaw": 1e9}}], r"coefficients\.yaw is 1e\+09; allowed: "),
         ("mechanism", (COUPLED,), [{**SUM, "lower": 1.0}], r"coupled_limits\.sum is \[1, 1\]; allowed: .* < upper"),
         ("mechanism", (COUPLED,), [{**SUM, "lower": 0.999}], r"coupled_limits\.sum: upper - lower is 0\.001; all"),
