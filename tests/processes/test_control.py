@@ -159,11 +159,12 @@ def test_guide_warns_about_a_model_without_validation(monkeypatch):
 def test_live_status_describes_new_refusals():
     first, status = Status(), Status()
     first.num_refused, status.num_refused, status.refusal_code = 3, 5, Status.REFUSAL_START_FAR
-    status.num_expired = 1
+    status.num_ignored, status.ignored_code, status.num_expired = 1, Status.REFUSAL_NOT_AUTHENTIC, 1
     maker = LiveStatusMaker(7, first)
     live = maker.make(status, 0.2, 0)
     assert live.problem == (
         "refused: start too far from the present efforts or pose, "
+        "the arm ignores messages: not signed with the arm's key (--key), "
         "the guard holds the arm because the last command expired"
     )
     assert str(live).endswith(live.problem)
