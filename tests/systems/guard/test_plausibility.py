@@ -191,6 +191,17 @@ def test_constant_position_under_changing_effort_is_frozen(joint, side):
             assert MS * ticks == pytest.approx(time, abs=1.5 * MS)
 
 
+def test_frozen_prismatic_joint_is_found():
+    count = PSM.encoder_counts()[2]
+    share = SETTINGS.frozen_effort + count / (0.1 * SETTINGS.frozen_deflection)
+    for factor, found in ((0.999, False), (1.001, True)):
+        sensors = Sensors(PSM)
+        sensors.move(np.zeros(N), ticks=1000)
+        sensors.effort = unit(2, factor * share * PSM.effort_limits[2])
+        fault, _ = sensors.move(np.zeros(N), ticks=500)
+        assert fault == found * f"{PSM.joint_names[2]}: the position does not change although the effort does"
+
+
 def test_joint_moving_by_a_count_is_not_frozen():
     sensors = Sensors()
     start, share = sensors.q.copy(), np.minimum(SETTINGS.frozen_effort + COUNTS / SETTINGS.frozen_deflection, 0.45)
