@@ -58,8 +58,7 @@ def ideal_model(arm: Arm) -> IdentifiedModel:
 
 
 #: Maximum holding effort at tuning poses, as a share of the motor's maximum effort. At other poses, a motor may
-#: saturate for any gains. For example, in a part of the joint box, the torque of an MTM's wrist spring exceeds the
-#: maximum torque of the motor.
+#: saturate for any gains.
 MAX_HOLDING_SHARE = 0.5
 
 
