@@ -20,6 +20,15 @@ A, LOWER, UPPER = ARM.limit_matrix()
 # The arm's clock
 
 
+def test_stopped_clock_is_a_fault():
+    bench = Bench().started()
+    for _ in range(10):
+        output = bench.step()
+    assert output.control_mode == Command.EFFORT
+    output = bench.step()
+    assert (output.control_mode, bench.guard.fault_code) == (Command.HOLD, Status.FAULT_CLOCK)
+
+
 @pytest.mark.parametrize("seconds", [1e-6, 0.011, 0.0499, 3.0, 1e9])
 def test_long_step_moves_at_most_10_ms(seconds):
     for mode in (Command.EFFORT, Command.POSITION):
