@@ -3,8 +3,8 @@
 python tools/make_samples.py
 
 The simulated arms have the friction, cables, stops, encoders, motors and delays of their arm files, except that the MTM
-has no wrist spring. The masses of their links differ from the SDF by up to 20 %, so the nominal model is wrong. Repeated
-runs on the same computer with the same packages give the same files.
+has no wrist spring. The masses of their links differ from the SDF by up to 20 %, so the nominal model is wrong.
+Repeated runs on the same computer with the same packages give the same files.
 """
 
 from __future__ import annotations
