@@ -37,6 +37,13 @@ def measurement():
     return measured
 
 
+def test_measurement_is_copied():
+    measured, q = measurement(), GOOD.copy()
+    measured.store(NOW, q, q, q)
+    q[:] = 9.0
+    np.testing.assert_array_equal(measured.q, GOOD)
+
+
 def test_clock_returns_elapsed_time():
     measured = Measurement(("a", "b", "c"), 20_000)
     assert measured.utime is None and measured.q is None

@@ -307,6 +307,17 @@ def test_sender_stall_expires_command_by_arm_clock(mode, milliseconds, continues
     assert continues == (bench.guard.hold_reason == "")
 
 
+def test_answer_to_old_measurement_has_its_wall_clock_age():
+    bench = WallBench().started()
+    assert bench.send(status_utime=bench.utime - 40 * MS) == Status.REFUSAL_NONE
+    bench.stall(10)
+    bench.step()
+    assert bench.guard.state == Status.STATE_EFFORT
+    bench.stall(0.001)
+    bench.step()
+    assert bench.guard.state == Status.STATE_HOLD
+
+
 def test_delayed_command_has_age_of_its_measurement():
     """A command that waits in the socket of a stopped process is recent by the arm's clock."""
     bench = WallBench().started()
