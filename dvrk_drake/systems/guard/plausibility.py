@@ -276,12 +276,13 @@ class EffortTracking(Check):
         if commanded is None:
             self._difference = self._time = self._zero
             return self._zero > 0.0
-        size = np.abs(commanded)
+        size, expected = np.abs(commanded), commanded
         if is_any(size > self._unsaturated):
-            # Coupled actuators may saturate although each joint effort is inside its limit.
-            commanded = clip(commanded @ self._J_inverse, -self._largest, self._largest) @ self._J
+            # Coupled actuators may saturate although each joint effort is inside its limit. Stronger motors are no fault.
+            saturated = clip(commanded @ self._J_inverse, -self._largest, self._largest) @ self._J
+            expected = clip(sample.effort, np.minimum(saturated, commanded), np.maximum(saturated, commanded))
         gain = min(sample.dt / self._filter_time, 1.0)
-        self._difference = self._difference + gain * (commanded - sample.effort - self._difference)
+        self._difference = self._difference + gain * (expected - sample.effort - self._difference)
         wrong = np.abs(self._difference) > self._tolerance + self._scale * size
         if 0.0 not in sample.effort.tolist():
             self._time = self._zero
