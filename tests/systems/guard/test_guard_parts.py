@@ -206,6 +206,17 @@ def test_sender_clock_must_advance_with_arm_clock(ahead, jumps):
         assert stream.send(41 * MS) is False
 
 
+def test_reset_is_a_change_from_false_to_true():
+    stream = Stream()
+    requested = [
+        stream.send(k * MS, reset=reset) for k, reset in enumerate([True, True, False, True, True, False, True])
+    ]
+    assert requested == [False, False, False, True, False, False, True]
+    # The flag of another sender does not count.
+    stream.send(8 * MS)
+    assert stream.send(60 * MS, sender=6, reset=True) is False
+
+
 def test_stopped_sender_clock_is_a_jump():
     stream = Stream()
     stream.send(0)
