@@ -278,7 +278,8 @@ class EffortTracking(Check):
             return self._zero > 0.0
         size, expected = np.abs(commanded), commanded
         if is_any(size > self._unsaturated):
-            # Coupled actuators may saturate although each joint effort is inside its limit. Stronger motors are no fault.
+            # Coupled actuators may saturate although each joint effort is inside its limit. An arm whose motors are
+            # stronger than its file states has no fault.
             saturated = clip(commanded @ self._J_inverse, -self._largest, self._largest) @ self._J
             expected = clip(sample.effort, np.minimum(saturated, commanded), np.maximum(saturated, commanded))
         gain = min(sample.dt / self._filter_time, 1.0)
