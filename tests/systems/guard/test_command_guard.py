@@ -358,3 +358,26 @@ def test_motors_get_power_only_by_hold_or_reset():
     for state, event, next_state in rows():
         if not state.is_powered and next_state.is_powered:
             assert event in (Event.HOLD, Event.RESET) and next_state is State.HOLD
+
+
+def test_foreign_messages_do_not_end_start():
+    bench = Bench()
+    bench.run(Command.EFFORT, 100)
+    for _ in range(160):
+        assert bench.guard.receive(None, bench.utime) == Status.REFUSAL_UNREADABLE
+        assert bench.guard.receive(bench.command(sender=9, arm_name="PSM1"), bench.utime) == Status.REFUSAL_WRONG_ARM
+        bench.run(Command.EFFORT, 1)
+    assert bench.guard.state == Status.STATE_EFFORT
+    assert (bench.guard.ignored_code, bench.guard.counts.ignored) == (Status.REFUSAL_WRONG_ARM, 320)
+    # Refused messages of the sender end the start.
+    bench = Bench()
+    bench.run(Command.EFFORT, 100)
+    assert bench.send(effort=[np.nan] * N) == Status.REFUSAL_NOT_FINITE
+    assert bench.guard.state == Status.STATE_HOLD
+
+
+def test_refused_command_keeps_command_in_force():
+    for mode in (Command.EFFORT, Command.POSITION):
+        bench = Bench().started(mode)
+        assert bench.send(mode, num_joints=3) == Status.REFUSAL_WRONG_SIZE
+        assert bench.tick().control_mode == mode

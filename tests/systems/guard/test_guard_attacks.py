@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from guard_bench import ARM, LIMIT, SESSION, Bench, Heavy, N, Q, Weightless
+from guard_bench import ARM, LIMIT, MS, SESSION, Bench, Heavy, N, Q, Weightless
 
 from dvrk_drake.errors import StationError
 from dvrk_drake.lcmtypes import lcmt_dvrk_command as Command
@@ -232,3 +232,14 @@ def test_settings_are_applied():
     assert bench.guard.state == Status.STATE_EFFORT
     bench.tick(20)
     assert bench.guard.state == Status.STATE_HOLD
+
+
+def test_controllers_alternating_at_expiry_never_act():
+    for gap, ignored in ((50 * MS, 20), (50 * MS + 1, 0)):
+        bench = Bench()
+        for k in range(40):
+            bench.send(sender=5 + k % 2)
+            bench.utime += gap
+            bench.step()
+            assert bench.guard.output.control_mode == Command.HOLD
+        assert bench.guard.counts.ignored >= (ignored > 0) and bench.guard.fault_code == Status.FAULT_NONE

@@ -473,3 +473,11 @@ def test_safe_state_without_finite_gravity_holds_the_pose():
     for _ in range(3):
         np.testing.assert_array_equal(bench.tick().position, Q)
         assert bench.output.control_mode == Command.HOLD
+
+
+def test_first_pose_slightly_beyond_limit_is_held():
+    q = Q.copy()
+    q[0] = ARM.position_upper[0] + 0.4 * (ARM.position_upper[0] - ARM.position_lower[0])
+    bench = Bench(q=q)
+    assert bench.guard.state == Status.STATE_HOLD
+    np.testing.assert_array_equal(bench.output.position, q)

@@ -1,5 +1,7 @@
 """Plausibility checks: detected faults, detection times, and plausible data without a fault."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from guard_bench import ARM, LIMIT, Bench, Heavy, Inert, N, Q, Weightless
@@ -479,3 +481,18 @@ def test_saturated_coupled_actuators_are_plausible():
     sensors.commanded = 0.4 * LIMIT * unit(1)
     sensors.effort = np.zeros(N)
     assert "does not follow the commanded effort" in sensors.move(COUNTS / MS, ticks=200)[0]
+
+
+def test_arm_without_encoder_counts_uses_tolerance_only():
+    exact = dataclasses.replace(ARM, effects=ARM.effects.without("encoder"))
+    for factor, found in ((0.99, False), (1.01, True)):
+        sensors = Sensors(exact)
+        sensors.q = sensors.q + unit(6, factor * SETTINGS.position_tolerance)
+        assert ("jumps" in sensors.measure()) == found
+
+
+def test_effort_after_power_on_is_plausible():
+    sensors = Sensors()
+    sensors.move(np.zeros(N), ticks=100)
+    sensors.effort = 0.9 * LIMIT
+    assert sensors.move(np.zeros(N), ticks=1000)[0] == ""
