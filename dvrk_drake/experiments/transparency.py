@@ -30,6 +30,8 @@ from dvrk_drake.systems.hand import Grip, Hand, PoseTrajectorySource
 SAMPLE_PERIOD = 5e-3
 #: Duration of the initial transient of the grasp, which is excluded from the evaluation [s].
 GRASP_TIME = 1.0
+#: Least duration of the evaluation [s], for 20 samples of the force.
+LEAST_TIME = 0.1
 #: Maximum excess over the joint limits [rad], [m]. A recording with a larger excess is rejected.
 MAX_LIMIT_EXCESS = 0.1, 0.01
 
@@ -156,7 +158,15 @@ def simulate_operator(
         frame_name: Name of the handle's frame. Default: `arm.frames.hand`.
         seed: Seed of the effects' noise.
         progress: Function called with the finished share, 0..1.
+
+    Raises:
+        ScenarioError: The path is too short.
     """
+    if path.end_time() < GRASP_TIME + LEAST_TIME:
+        raise ScenarioError(
+            f"the path takes {path.end_time():.2g} s; allowed: {GRASP_TIME + LEAST_TIME:g} s or more, because the "
+            f"first {GRASP_TIME:g} s of the grasp are not evaluated"
+        )
     name, frame = arm.name.lower(), ArmFrame(arm, frame_name)
     knots = np.arange(path.start_time(), path.end_time(), 0.02)
     poses = [frame.pose(path.value(t).ravel()) for t in knots]

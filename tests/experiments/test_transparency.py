@@ -66,6 +66,7 @@ def test_recorded_path_respects_limits_and_speed():
         recorded_path(ARM, Recording(q=middle + (half + 0.2) * np.sin(t)[:, None], t=t, tau=np.zeros_like(q)))
     assert_refused(ScenarioError, "speed is 0", recorded_path, ARM, Recording(q=q, t=t, tau=np.zeros_like(q)), speed=0)
     assert_refused(ScenarioError, "no times", recorded_path, ARM, Recording(q=q, tau=np.zeros_like(q)))
+    assert_refused(ScenarioError, "takes 0.9 s", simulate_operator, ARM, constant_pose(0.9), Compensation("nothing"))
     assert_refused(ScenarioError, "has 2 different times", recorded_path, ARM, Recording(q=q[:2], t=t[:2]))
     with pytest.raises(ScenarioError, match="parallelogram exceeds the limits of MTML"):
         recorded_path(ARM, Recording(q=q + 0.6 * np.array([0, 1, 1, 0, 0, 0, 0]), t=t))
