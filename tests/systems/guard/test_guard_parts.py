@@ -253,9 +253,13 @@ SETTINGS = [
     *(("", lambda name, value: GuardSettings(**{name: value}), *row) for row in numbers(GuardSettings)),
     *(("plausibility.", of_a_check, *row) for row in numbers(PlausibilitySettings)),
 ]
+#: Names of the tests, which must be equal in all processes.
+each_setting = pytest.mark.parametrize(
+    ("prefix", "create", "name", "default", "allowed"), SETTINGS, ids=[setting[2] for setting in SETTINGS]
+)
 
 
-@pytest.mark.parametrize(("prefix", "create", "name", "default", "allowed"), SETTINGS, ids=str)
+@each_setting
 def test_each_setting_has_bounds(prefix, create, name, default, allowed):
     for value in (allowed.low, default, allowed.high):
         create(name, value)
@@ -266,7 +270,7 @@ def test_each_setting_has_bounds(prefix, create, name, default, allowed):
             create(name, value)
 
 
-@pytest.mark.parametrize(("prefix", "create", "name", "default", "allowed"), SETTINGS, ids=str)
+@each_setting
 def test_settings_weaker_than_defaults_are_named(prefix, create, name, default, allowed):
     weaker, stronger = allowed.low, allowed.high
     if name not in WEAKER_IF_SMALLER:
