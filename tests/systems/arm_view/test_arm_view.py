@@ -215,7 +215,7 @@ HOME = {"mtml": np.zeros(7), "psm": np.array([0, 0, 0.1, 0, 0, 0, 0])}
 
 @pytest.mark.parametrize("views", [1, 3])
 def test_view_is_not_destroyed_in_another_thread(views, monkeypatch):
-    """Drake ends the process there, e.g. when a thread of Dask collects garbage. This thread destroys old views."""
+    """Drake ends the process there, e.g. when another thread collects garbage. This thread destroys old views."""
     monkeypatch.setattr(page, "MAX_VIEWS", 2)
 
     def check():
