@@ -389,11 +389,12 @@ def _absolute(path: str) -> str:
 def _run(words: Sequence[str], folder: Path) -> int:
     """Runs a command in the folder and returns its exit code. Signals to this process end the command first."""
     command = [sys.executable, "-m", "dvrk_drake.cli", *words]
-    process = subprocess.Popen(command, cwd=folder, preexec_fn=_end_with_parent)  # noqa: PLW1509  no other thread runs
     received: list[int] = []
     num_sent = 0
+    # Before the start of the process, so that no signal ends this process while the command runs.
     handlers = {number: signal.signal(number, lambda n, _: received.append(n)) for number in _SIGNALS}
     try:
+        process = subprocess.Popen(command, cwd=folder, preexec_fn=_end_with_parent)  # noqa: PLW1509  one thread
         while True:
             try:
                 code = process.wait(_FORWARD)
