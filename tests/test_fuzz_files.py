@@ -187,7 +187,7 @@ READERS = {
     "mtm_2015_good72.csv": ("csv", 20, lambda path: PaperRecordings(path.parent).poses),
     "poses.csv": ("csv", 30, lambda path: read_recording(path, load_arm("mtml")).check_fits(load_arm("mtml"))),
     "team.mat": ("binary", 30, lambda path: convert(path, path.parent / "out.csv")),
-    "wpi.csv": ("csv", 20, lambda path: convert(path, path.parent / "out.csv", skip_invalid=True)),
+    "wpi.csv": ("csv", 20, lambda path: read_recording(path, load_arm("psm"), skip_invalid=True)),
     "status.log": ("binary", 30, lambda path: read_recording(path, load_arm("mtml"))),
     "collection.csv": ("csv", 20, read_collection),
     "results.csv": ("csv", 20, read_results),

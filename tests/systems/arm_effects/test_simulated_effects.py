@@ -135,7 +135,7 @@ def test_hand_moves_and_releases_the_arm():
     force = np.linalg.norm(simulation.hand[:, 3:], axis=1)
     gripped = (simulation.time >= 0.1) & (simulation.time <= 0.7)
     assert np.all(force[~gripped] == 0.0)
-    assert 0.5 < force[gripped].max() <= HandScenario().max_force
+    assert 0.5 < force[gripped].max() <= HandScenario().grip.max_force
     way = [np.linalg.norm(frame.pose(q).translation() - frame.pose(TWO_POSES[1]).translation()) for q in TWO_POSES]
     k = np.flatnonzero(gripped)[-1]
     reached = frame.pose(simulation.state_true[k, :7]).translation() - frame.pose(TWO_POSES[1]).translation()
