@@ -108,9 +108,10 @@ def status(*, connected: options.ConnectedArm, watch: bool = False) -> None:
 def stop(*, connected: options.ConnectedArm, power_off: bool = False) -> None:
     """Stop an arm.
 
-    LCM: the guard obeys every sender with the key, also while a controller acts, and holds the arm until an operator
-    resumes. ROS 2: the arm receives hold. A program that continues to publish commands moves it again; a bridge does
-    not. This command does not replace the emergency stop button.
+    LCM: the guard obeys every sender with the key, also while a controller acts, and then holds the arm until an
+    operator resumes. If no controller acts, the next one can start. ROS 2: the arm receives hold. A program that
+    continues to publish commands moves it again; a bridge does not. This command does not replace the emergency stop
+    button.
 
     Args:
         power_off: Also switch the motor power off. An arm without brakes falls.

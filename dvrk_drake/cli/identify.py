@@ -216,7 +216,7 @@ def predict(
     from dvrk_drake.recordings.csv_files import write_csv
     from dvrk_drake.reports.terminal import make_console
 
-    support.check_output(output, recording, model, overwrite=overwrite)
+    support.check_output(output, recording, model, overwrite=overwrite, suffix=".csv")
     with support.Steps(*_STEPS, "predicting") as steps:
         loaded, read = _model_and_recording(model, recording, file, steps)
         coordinates = read.file_coordinates or read.coordinates
@@ -250,7 +250,7 @@ def recalibrate(
     """
     from dvrk_drake.reports.identification import recalibration_page
 
-    support.check_output(output, recording, model, overwrite=overwrite)
+    support.check_output(output, recording, model, overwrite=overwrite, suffix=".yaml")
     with support.Steps(*_STEPS, "refitting friction") as steps:
         result = dvrk.recalibrate(*_model_and_recording(model, recording, file, steps), progress=steps)
     result.save(output, overwrite=True)

@@ -212,7 +212,8 @@ def export_model(
     arm = options.with_instrument(arm, instrument) if arm else None
     loaded = support.load_model(model, arm)
     for format, path in outputs.items():
-        support.check_output(path, model or "", configuration or "", overwrite=overwrite)
+        suffix = {"sdf": ".sdf", "urdf": ".urdf", "mjcf": ".xml"}.get(format, "")  # --arm recognises models by it
+        support.check_output(path, model or "", configuration or "", overwrite=overwrite, suffix=suffix)
         if format in MODEL_FORMATS:
             refuse_existing_meshes(path, overwrite)
     settings: dict[str, Any] = {

@@ -89,14 +89,17 @@ def load_key(path: str | None) -> MessageKey | None:
     return None if path is None else MessageKey.load(path)
 
 
-def check_output(path: str, *inputs: str, overwrite: bool) -> None:
+def check_output(path: str, *inputs: str, overwrite: bool, suffix: str = "") -> None:
     """Checks an output path before work begins. Rejects an existing file, an input file, and an unwritable path.
 
     Args:
         path: Path of the output.
         inputs: Paths of the inputs.
         overwrite: Accept an existing file, because of --overwrite or because the command continues its own output.
+        suffix: Required end of the name. "": any.
     """
+    if not path.lower().endswith(suffix):
+        raise DvrkDrakeError(f"{path}: the name of the file must end in {suffix}")
     target = Path(os.path.realpath(path))
     _refuse_twice(path)
     if not target.parent.is_dir():

@@ -39,6 +39,8 @@ def refused(capsys, *arguments):
         ("demo --seed -1", 'Invalid value "-1" for --seed: must be >= 0; see'),
         ("simulate study s.yaml --output r.csv --workers 0", "--workers: must be >= 1"),
         ("record r.csv --arm psm --duration nan", "must be a number of seconds greater than 0"),
+        ("predict r.csv --model m.yaml --output p.yaml", "p.yaml: the name of the file must end in .csv"),
+        ("export --arm psm --urdf psm.xml", "psm.xml: the name of the file must end in .urdf"),
         ("export --sdf out.sdf", "give exactly one of --model, --arm; see dvrk-drake export --help"),
         ("export --arm psm --model m.yaml --sdf o", "give exactly one of --model, --arm; see"),
         ("simulate psm", "psm is an arm, not a scenario; use --arm psm"),
