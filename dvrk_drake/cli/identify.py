@@ -250,7 +250,7 @@ def recalibrate(
     """
     from dvrk_drake.reports.identification import recalibration_page
 
-    support.check_output(output, recording, model, overwrite=overwrite, suffix=".yaml")
+    support.check_output(output, recording, model, overwrite=overwrite)
     with support.Steps(*_STEPS, "refitting friction") as steps:
         result = dvrk.recalibrate(*_model_and_recording(model, recording, file, steps), progress=steps)
     result.save(output, overwrite=True)

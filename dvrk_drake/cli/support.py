@@ -98,8 +98,6 @@ def check_output(path: str, *inputs: str, overwrite: bool, suffix: str = "") -> 
         overwrite: Accept an existing file, because of --overwrite or because the command continues its own output.
         suffix: Required end of the name. "": any.
     """
-    if not path.lower().endswith(suffix):
-        raise DvrkDrakeError(f"{path}: the name of the file must end in {suffix}")
     target = Path(os.path.realpath(path))
     _refuse_twice(path)
     if not target.parent.is_dir():
@@ -118,6 +116,8 @@ def check_output(path: str, *inputs: str, overwrite: bool, suffix: str = "") -> 
             raise DvrkDrakeError(f"{path}: is an input file; choose another output file")
     if os.path.exists(target) and not overwrite:
         raise DvrkDrakeError(f"{path} already exists. Choose another file, or replace it with --overwrite.")
+    if not path.lower().endswith(suffix):
+        raise DvrkDrakeError(f"{path}: the name of the file must end in {suffix}")
 
 
 def _refuse_twice(path: str) -> None:
