@@ -1,8 +1,9 @@
-"""Automatic style checks: banned words, docstrings, test names, length of the README."""
+"""Automatic style checks: banned words, docstrings, test names, length of the README, files of the wheel."""
 
 import ast
 import re
 import subprocess
+import tomllib
 from pathlib import Path
 
 from repository import ROOT
@@ -141,3 +142,10 @@ def test_method_names_follow_the_style():
     assert sum(is_system for _, is_system, _ in methods) > 10
     wrong = [where for where, is_system, name in methods if name[0].isupper() != is_system and name not in OF_DRAKE]
     assert not wrong, wrong
+
+
+def test_the_wheel_contains_all_files_of_the_package():
+    """A moved file would be missing only in an installed package."""
+    patterns = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]["dvrk_drake"]
+    packed = {path for pattern in patterns for path in (ROOT / "dvrk_drake").glob(pattern)}
+    assert not [path for path in tracked("dvrk_drake") if path.suffix != ".py" and path not in packed]
