@@ -128,7 +128,7 @@ class TimedSimulatedArm(SimulatedArm):
     """Simulated arm of `dvrk-drake sim-arm` that stores the times of its messages."""
 
     def __init__(self) -> None:
-        self.times = Times()
+        self.times, self.first = Times(), 0
         super().__init__(ARM, DvrkDriver(lcm_url=usable_lcm_url()), start_pose(ARM))
 
     @property
@@ -138,11 +138,14 @@ class TimedSimulatedArm(SimulatedArm):
 
     def receive(self, channel: str, data: bytes) -> None:
         """Stores the time, then receives a command."""
-        self.times.store_answer(data, first=1)
+        self.times.store_answer(data, self.first)
         super().receive(channel, data)
 
     def send(self, network: lcm.LCM) -> None:
         """Stores the time, then sends a status."""
+        if not self.times.sent:
+            # The first statuses of the arm are not published.
+            self.first = lcmt_dvrk_status.decode(self._status).sequence
         self.times.start_trip()
         super().send(network)
 
